@@ -13,7 +13,7 @@ import hashlib
 import logging
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli.dataset.dataset import Dataset
+from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.weights import (
     DEFAULT_MEMORY_BYTES,
     EnvmapTask,
@@ -34,7 +34,6 @@ from facerf_cli.dataset.weights import (
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import checked, digest
-from facerf_cli.files.image_metadata import Attributes
 from facerf_cli.files.olat_stack import read_olat_header
 from facerf_cli.files.texts import parse_json, text_of
 from facerf_cli.files.write import write_exr
@@ -132,7 +131,11 @@ def read_pairs(dataset: Dataset) -> list[Pair]:
     for number, line in enumerate(text_of(path.read_bytes(), "replace").splitlines(), 1):
         try:
             pair = checked(Pair, parse_json(line), f"line {number}")
-            check_pair(dataset, pair)
+            known = {pair.source_camera, pair.target_camera} <= set(dataset.cameras[pair.subject])
+            if not known or pair.split != dataset.split_of(pair.subject):
+                raise ValueError("another camera or split")
+            if not 0 <= pair.target_light < len(dataset.lights_of(pair.subject)):
+                raise ValueError("no such light")
             if pairs and pair.key <= pairs[-1].key:
                 raise ValueError("not sorted, or repeated")
         except (ValueError, KeyError, InputError):
@@ -141,16 +144,6 @@ def read_pairs(dataset: Dataset) -> list[Pair]:
             ) from None
         pairs.append(pair)
     return pairs
-
-
-def check_pair(dataset: Dataset, pair: Pair) -> None:
-    """Raise KeyError or ValueError if a pair does not fit the dataset."""
-    if not {pair.source_camera, pair.target_camera} <= set(dataset.cameras[pair.subject]):
-        raise ValueError("unknown camera")
-    if pair.split != dataset.split_of(pair.subject):
-        raise ValueError("wrong split")
-    if not 0 <= pair.target_light < len(dataset.lights_of(pair.subject)):
-        raise ValueError("number out of range")
 
 
 def write_pairs(dataset: Dataset, drawn: list[Pair], overwrite: bool, spread: Spread = map) -> list[Pair]:
@@ -195,17 +188,14 @@ def _images(dataset: Dataset) -> list[Path]:
     return list((dataset.folder / RELIT).glob("*/[0-9]*.exr"))
 
 
-def weights_path(dataset: Dataset) -> Path:
-    """Return the path of the weights of the current pairs."""
-    return _weights_path(dataset, pairs_path(dataset).read_bytes())
-
-
-def _weights_path(dataset: Dataset, pairs_text: bytes) -> Path:
-    return dataset.folder / RELIT / f"weights-{digest(pairs_text)}.npy"
+def weights_path(dataset: Dataset, pairs_text: bytes | None = None) -> Path:
+    """Return the path of the weights of pairs.jsonl, or of a new text of it."""
+    text = pairs_path(dataset).read_bytes() if pairs_text is None else pairs_text
+    return dataset.folder / RELIT / f"weights-{digest(text)}.npy"
 
 
 def _write_weights(dataset: Dataset, weights: np.ndarray, pairs_text: bytes) -> None:
-    path = _weights_path(dataset, pairs_text)
+    path = weights_path(dataset, pairs_text)
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         np.save(file, weights)
     for old in path.parent.glob("weights-*.npy"):
@@ -220,30 +210,21 @@ def load_pairs(dataset: Dataset) -> dict[str, tuple[list[Pair], np.ndarray]]:
     pairs.jsonl changes.
     """
     path = pairs_path(dataset)
-    if not path.is_file():
-        return {}
-    return _load_pairs(_ByFolder(dataset, dataset.folder.absolute()), path.stat().st_mtime_ns)
-
-
-@dataclass(frozen=True)
-class _ByFolder:
-    """Dataset as a cache key."""
-
-    dataset: Dataset = field(compare=False)
-    folder: Path
+    return _load_pairs(dataset.folder.absolute(), path.stat().st_mtime_ns) if path.is_file() else {}
 
 
 @lru_cache(maxsize=1)  # large tables, one dataset at a time
-def _load_pairs(key: _ByFolder, changed_ns: int) -> dict[str, tuple[list[Pair], np.ndarray]]:
-    pairs = read_pairs(key.dataset)
-    weights = _load_weights(key.dataset, pairs)
+def _load_pairs(folder: Path, changed_ns: int) -> dict[str, tuple[list[Pair], np.ndarray]]:
+    dataset = read_dataset(folder)
+    pairs = read_pairs(dataset)
+    weights = _load_weights(dataset, pairs)
     rows_of: dict[str, list[int]] = defaultdict(list)
     for row, pair in enumerate(pairs):
         rows_of[pair.subject].append(row)
     return {
         subject: (
             pairs[rows[0] : rows[-1] + 1],
-            weights[rows[0] : rows[-1] + 1, : len(key.dataset.lights_of(subject))],
+            weights[rows[0] : rows[-1] + 1, : len(dataset.lights_of(subject))],
         )
         for subject, rows in rows_of.items()
     }
@@ -329,14 +310,10 @@ def relight_subject(
         images = relit_images(path, torch.from_numpy(np.array(weights[rows])), memory_bytes)
         attributes = attributes_of_sum(read_olat_header(path).metadata)
         for row, image in zip(rows, images, strict=True):
-            write_source(image_path(dataset, *pairs[row].key), pairs[row], image, attributes)
+            recipe = {f"facerf:{name}": value for name, value in asdict(pairs[row]).items()}
+            pixels = image.permute(1, 2, 0).float().numpy()
+            write_exr(image_path(dataset, *pairs[row].key), pixels, metadata={**attributes, **recipe})
     return len(todo)
-
-
-def write_source(path: Path, pair: Pair, image: Tensor, attributes: Attributes) -> None:
-    """Write the source [3, H, W] of a pair, with the pair and attributes as metadata."""
-    recipe = {f"facerf:{name}": value for name, value in asdict(pair).items()}
-    write_exr(path, image.permute(1, 2, 0).float().numpy(), metadata={**attributes, **recipe})
 
 
 def render_source(dataset: Dataset, row: Pair | Mapping[str, Any]) -> Tensor:

@@ -53,12 +53,10 @@ from facerf_cli.training.losses import (
     Features,
     MaskedPair,
     PaperWeights,
-    appearance_loss,
     channels_apart,
     clipped_si_mse,
     colour_shares,
     landmark_loss,
-    light_loss,
     load_features,
     photometric_loss,
     regularisation,
@@ -96,17 +94,16 @@ class PosedHeads(Batch):
 
 def pose_heads(model: MorphableModel, estimate: GeometryEstimate) -> PosedHeads:
     """v^c = R v(alpha, beta) + t, with as many leading shapes of the model as there are coefficients."""
-    head = leading(model, estimate.alpha.shape[1], estimate.beta.shape[1])
-    turned = head.vertices(estimate.alpha, estimate.beta) @ estimate.rotation.mT
-    vertices = turned + estimate.translation_m[:, None]
+    identities, expressions = estimate.alpha.shape[1], estimate.beta.shape[1]
+    head = replace(
+        model,
+        identity=model.identity[:identities],
+        expression=model.expression[:expressions],
+        expression_names=model.expression_names[:expressions],
+    )
+    rotated = head.vertices(estimate.alpha, estimate.beta) @ estimate.rotation.mT
+    vertices = rotated + estimate.translation_m[:, None]
     return PosedHeads(vertices, estimate.rotation, chosen(head.landmarks(vertices), FIXED_LANDMARKS))
-
-
-def leading(model: MorphableModel, identities: int, expressions: int) -> MorphableModel:
-    """Keep the leading shapes of a model, as many as a Geometry Network has coefficients."""
-    identity, expression = model.identity[:identities], model.expression[:expressions]
-    names = model.expression_names[:expressions]
-    return replace(model, identity=identity, expression=expression, expression_names=names)
 
 
 @dataclass(frozen=True)
@@ -301,11 +298,14 @@ class JointObjective(Objective):
         texture = MaskedPair(relit.texture, relit.truth.texture, (relit.truth.visible > 0).float())
         with self.mixed_precision():
             if "appearance" in self.feature_networks:
-                image = MaskedPair(relit.image, batch.target, relit.mask)
-                appearance = appearance_loss(self.features["appearance"], image, texture)
+                image, features = (
+                    MaskedPair(relit.image, batch.target, relit.mask),
+                    self.features["appearance"],
+                )
+                appearance = image.distance(features) + texture.distance(features)
                 terms["appearance_features"] = weights.features * appearance
             if "light" in self.feature_networks:
-                terms["light_features"] = weights.features * light_loss(self.features["light"], texture)
+                terms["light_features"] = weights.features * texture.distance(self.features["light"])
         return terms
 
     def measure(self) -> None:

@@ -79,19 +79,14 @@ def landmark_loss(found_px: Tensor, detected_px: Tensor, side_px: int) -> Tensor
     return difference.square().sum(-1).mean(1)
 
 
-@torch.no_grad()
-def closest_points(candidates_px: Tensor, detected_px: Tensor) -> Tensor:
-    """Return the index [B, N] of the candidate [B, C, 2] closest to each detected point [B, N, 2].
+def slid_contour(candidates_px: Tensor, detected_px: Tensor) -> Tensor:
+    """Select the candidates [B, C, 2] closest to the detected points [B, N, 2]: [B, N, 2].
 
     Contour landmarks slide on the mesh; the choice of their vertices has no gradient.
     """
-    return torch.cdist(detected_px, candidates_px, compute_mode="donot_use_mm_for_euclid_dist").argmin(-1)
-
-
-def slid_contour(candidates_px: Tensor, detected_px: Tensor) -> Tensor:
-    """Select the candidates [B, C, 2] closest to the detected points [B, N, 2]: [B, N, 2], with gradient."""
-    ids = closest_points(candidates_px, detected_px)
-    return candidates_px.gather(1, ids[..., None].expand(-1, -1, 2))
+    with torch.no_grad():
+        distances = torch.cdist(detected_px, candidates_px, compute_mode="donot_use_mm_for_euclid_dist")
+    return candidates_px.gather(1, distances.argmin(-1)[..., None].expand(-1, -1, 2))
 
 
 def regularisation(alpha: Tensor, beta: Tensor, weights: PaperWeights = _PAPER) -> Tensor:
@@ -130,7 +125,10 @@ class Features:
 
 @dataclass(frozen=True)
 class MaskedPair:
-    """Prediction and target [B, 3, H, W], linear, compared in the mask [B, 1, H, W]."""
+    """Prediction and target [B, 3, H, W], linear, compared in the mask [B, 1, H, W].
+
+    L_I is the `distance` of V_f of the image plus the one of the texture, L_L the one of S_f of the texture.
+    """
 
     prediction: Tensor
     target: Tensor
@@ -146,16 +144,6 @@ class MaskedPair:
         if not features.apart:
             return distance
         return (distance.view(-1, 3) * shares.flatten(1)).mean(1)  # so that channels are pulled alike
-
-
-def appearance_loss(features: Features, image: MaskedPair, texture: MaskedPair) -> Tensor:
-    """Return L_I [B]: distance of V_f features, of the image and of the texture."""
-    return image.distance(features) + texture.distance(features)
-
-
-def light_loss(features: Features, texture: MaskedPair) -> Tensor:
-    """Return L_L [B]: distance of S_f features, which depend on the light's direction, of the texture."""
-    return texture.distance(features)
 
 
 def load_features(
