@@ -174,7 +174,8 @@ class DatasetFaces:
         subject = self.dataset.subjects[int(head)]
         pairs = load_pairs(self.dataset).get(subject, ([],))[0]
         reader = PairReader(self.dataset, (subject,), pairs, self.crop_px)
-        pair, source = reader.draw_sources(generator.initial_seed())[0]
+        seed = int(torch.randint(1 << 31, (), generator=generator))
+        pair, source = reader.draw_sources(seed)[0]
         return self._sample(pair, source.float(), lights, generator)
 
     def _sample(self, pair: Pair, source: Tensor, lights: int, generator: torch.Generator) -> SampleCrops:
