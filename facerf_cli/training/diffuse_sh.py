@@ -94,7 +94,7 @@ class DiffuseObjective(SamplesObjective):
 
         The sheet has two rows per face: source and targets; predicted source and targets, albedo and shading.
         """
-        errors: list[tuple[Tensor, Tensor]] = []
+        errors: list[Tensor] = []
         same_pose: list[bool] = []
         rows: list[np.ndarray] = []
         for held_out in self.held_out_samples():
@@ -103,11 +103,12 @@ class DiffuseObjective(SamplesObjective):
             estimate = self.network(sample.source, sample.normals_source, sample.visible)
             own, relit = predicted_images(estimate, sample, batch.coefficients)
             of_source = clipped_si_mse(own, sample.source[:, None], sample.visible).mean()
-            errors.append((clipped_si_mse(relit, sample.target, sample.weight).mean(), of_source))
+            of_target = clipped_si_mse(relit, sample.target, sample.weight).mean()
+            errors.append(torch.stack([of_target, of_source]).cpu())
             turned = (sample.normals_source - sample.normals_target).abs().max()
             same_pose.append(bool(turned < 1e-3))
             rows += [_sheet_rows(sample, estimate, own, relit)] if len(rows) < _SHEET_FACES else []
-        of_targets, of_sources = torch.tensor(errors).T
+        of_targets, of_sources = torch.stack(errors).T
         metrics = metrics_by_pose(of_targets, torch.tensor(same_pose))
         return Validation({**metrics, "si_mse_source": float(of_sources.mean())}, np.concatenate(rows))
 

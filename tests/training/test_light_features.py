@@ -81,8 +81,9 @@ def test_the_crops_of_a_stack_give_its_textures(tmp_path: Path) -> None:
         info, olats = stack_info(path), read_olats(path).float()
         light = (found.lights_head[0] @ (info.directions @ info.rotation).T).argmax(1)
         vertices = info.fit.vertices_camera(faces.model)
-        wanted, _ = unwrap(olats[light], vertices, grid_triangles(), info.fit.camera, 32)
-        difference = found.textures[0] - wanted * colours[:, None, None]
+        images = olats[light].flatten(0, 1)
+        wanted, _ = unwrap(images, vertices, grid_triangles(), info.fit.camera, 32)
+        difference = found.textures[0] - wanted.view(5, 3, 32, 32) * colours[:, None, None]
         errors.append(float(difference[found.textures[0] > 0].abs().mean() / found.textures.mean()))
     assert min(errors) < 0.03 < 0.3 < max(errors)  # another camera's view of the face
     stage = LightFeaturesObjective(faces, LightNetwork(LightSettings(1 / 16, 4, 8, 32)), SETTINGS)
