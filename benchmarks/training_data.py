@@ -2,23 +2,21 @@
 
     python benchmarks/training_data.py --dataset DATASET [--side 512] [--steps 128]
 
-`DATASET` is prepared, with pairs that were written. Of lazy pairs the mean over a block of steps counts, in
-which each stack is opened once. `light-features` reads in workers and unwraps in the step: both are given.
+`DATASET` is prepared, with pairs. For `joint` and `reflectance` the mean is over a block of steps in which
+each stack is opened once. `reflectance` and `light-features` read in workers and unwrap in the step: both are
+given.
 """
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
-from unittest.mock import patch
 
 import torch
 from _common import arguments, print_header, print_row, required
 
-from facerf_cli.dataset import crops
 from facerf_cli.dataset.crops import open_pairs
 from facerf_cli.dataset.dataset import read_dataset
-from facerf_cli.dataset.light_crops import open_light_stacks
+from facerf_cli.dataset.faces import open_faces
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.network.features import VggFeatures
 from facerf_cli.training.joint import JointObjective, JointSettings
@@ -31,27 +29,30 @@ def main() -> None:
     parser = arguments(__doc__)
     parser.add_argument("--dataset", type=Path)
     parser.add_argument("--side", type=int, default=512)
-    parser.add_argument("--steps", type=int, default=128, help="of lazy pairs, in which 4 stacks are opened")
+    parser.add_argument("--steps", type=int, default=128, help="of pairs, in which 4 stacks are opened")
     given = parser.parse_args()
     torch.set_num_threads(1)
     folder = required(given.dataset, "a prepared dataset with pairs", "--dataset")
     dataset = read_dataset(folder)
     reader = open_pairs(dataset, "train", given.side)
     print_header("what", "seconds")
-    print_row("joint, written: a sample", per_step(lambda step: reader.draw(1, generator_of(step), step), 16))
-    with patch.object(crops, "image_path", lambda *key: Path("none")):
-        lazy = replace(reader)
-        found = per_step(lambda step: lazy.draw(1, generator_of(step), step), given.steps)
-        print_row("joint, lazy: a sample", found)
-        found = per_step(lambda step: lazy.read(lazy.pairs[step]), 3)
-    print_row("joint, lazy: a sample, were its stack opened for it alone", found)
-    stacks = open_light_stacks(folder, dataset.face_model)
-    heads = stacks.heads(1)[0]
-    drawn = [stacks.draw(heads[:1], LIGHTS, seeded(0, face)) for face in range(FACES)]
-    face = per_step(lambda step: stacks.draw(heads[:1], LIGHTS, seeded(step)), FACES)
-    print_row(f"light-features: reading a step of {FACES} faces x {LIGHTS} lights", FACES * face)
-    unwrapping = per_step(lambda step: drawn[step].unwrapped(given.side), FACES)
-    print_row("light-features: unwrapping it in the step", FACES * unwrapping)
+    sample_s = per_step(lambda step: reader.draw(1, generator_of(step), step), given.steps)
+    print_row("joint: a sample", sample_s)
+    alone_s = per_step(lambda step: reader.read(reader.pairs[step : step + 1]), 3)
+    print_row("joint: a sample whose stack is opened only for it", alone_s)
+    faces = open_faces(folder, dataset.face_model, given.side)
+    sample_s = per_step(lambda step: faces.draw_shared(LIGHTS, generator_of(step), 0, step), given.steps)
+    print_row(f"reflectance: reading a sample of {LIGHTS} lights", sample_s)
+    sample = faces.draw_shared(LIGHTS, generator_of(0), 0, 0)[1]
+    print_row(
+        "reflectance: unwrapping it in the step", per_step(lambda step: sample.unwrapped(given.side), FACES)
+    )
+    heads = faces.heads(1)[0]
+    drawn = [faces.draw_lights(heads[:1], LIGHTS, seeded(0, face)) for face in range(FACES)]
+    face_s = per_step(lambda step: faces.draw_lights(heads[:1], LIGHTS, seeded(step)), FACES)
+    print_row(f"light-features: reading a step of {FACES} faces x {LIGHTS} lights", FACES * face_s)
+    unwrapping_s = per_step(lambda step: drawn[step].unwrapped(given.side), FACES)
+    print_row("light-features: unwrapping it in the step", FACES * unwrapping_s)
     settings = JointSettings(given.side, given.side)
     networks = (torch.nn.Linear(1, 1), torch.nn.Linear(1, 1), VggFeatures(), VggFeatures())
     networks[0].rig_lights = 0  # type: ignore[assignment]

@@ -27,9 +27,8 @@ from facerf_cli.network.geometry import GeometryNetwork, GeometryNetworkSettings
 from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from facerf_cli.network.reflectance_paper import PaperReflectanceNetwork
 from facerf_cli.training.joint import JointObjective
-from facerf_cli.training.loop import train
+from facerf_cli.training.loop import build_optimizer, train
 from facerf_cli.training.objective import Objective, Validation, seeded
-from facerf_cli.training.run_folder import build_optimizer
 from facerf_cli.training.settings import PRESETS, TrainSettings
 from facerf_cli.training.texture import TextureObjective
 

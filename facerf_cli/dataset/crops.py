@@ -1,24 +1,22 @@
-"""Crops of a prepared dataset for the joint stage: a relit source and a light of a stack (paper, 'Dataset').
+"""Read crops of a prepared dataset's pairs for training; sources are summed from OLAT stacks.
 
-Each line of relit/pairs.jsonl gives a pair of crops. The source is the image that `relight-dataset` wrote, or
-else the weighted sum of the whole stack, which takes a hundred times as long: a stack that is opened gives
-the sources of many steps. The target is one part of a
-stack. Both have the exposure of the texture stages: the source so that the face's mean radiance is
-`MEAN_RADIANCE`, the target so that the mean would be that under a constant map of radiance 1.
+A line of relit/pairs.jsonl is a recipe (`dataset/pairs.py`). The source is always summed from its stack, and
+the target is one part of a stack; training never reads the images that `relight-dataset` writes. One open
+stack provides the sources of many steps. The stage `joint` reads `CropPairs` (paper, 'Dataset'): the source
+has a mean radiance of `MEAN_RADIANCE` on the face, the target would have it under a constant map of
+radiance 1. The stages that train on textures read crops through `dataset/faces.py`.
 
-Crops move at random, because at test time a crop is cut around a detector's box, not around landmarks. The
-spreads are those of `face.crop.from_box` against `face.crop.from_landmarks` on synthetic people in eight
-cameras: a detector's box is off to the side where a head is turned.
-
-`open_photos` gives crops of faces in photos, with detected landmarks: found once, kept in a cache.
+Crops are moved at random, because at test time a crop is cut around a detector's box, not around landmarks.
+The spreads were measured between `face.crop.from_box` and `face.crop.from_landmarks` on synthetic people in
+eight cameras: the box of a turned head is shifted sideways.
 """
 
-import logging
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, partial
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -26,30 +24,34 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.batch.recipe import Recipe, key_of, text_of_state
 from facerf_cli.dataset.dataset import PREPARE_AGAIN, Dataset, people_of, read_stack
-from facerf_cli.dataset.pairs import DRAW_AGAIN, Pair, image_path, load_pairs, read_pairs
+from facerf_cli.dataset.pairs import Pair, load_pairs
 from facerf_cli.dataset.weights import relit_images
 from facerf_cli.errors import InputError
-from facerf_cli.face.crop import from_landmarks
-from facerf_cli.face.fit import load_fit
-from facerf_cli.files.documents import Document, Points68, read_document, write_document
-from facerf_cli.files.olat_stack import StackHeader, read_olats
-from facerf_cli.files.read import read_image
-from facerf_cli.files.write import write_display
+from facerf_cli.face.fit import FaceFit, load_fit
+from facerf_cli.face.topology import grid_triangles, on_device
+from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.network.inputs import MEAN_RADIANCE, Batch, concatenate, resize
-from facerf_cli.portrait.find import find_faces
-from facerf_cli.relighting.models import Networks
-from facerf_cli.run.logs import LOGGER_NAME
-from facerf_cli.run.workers import in_shards
+from facerf_cli.raster.camera import crop_camera
+from facerf_cli.raster.texture import UnwrapSettings, unwrap
+from facerf_cli.synth.bank.texture_samples import draw_light, draw_target_lights
 
 _LOG_SCALE, _SHIFT = 0.07, (0.1, 0.03)  # standard deviations; shifts right and down in sides of the crop
 _MOST = 2.0  # standard deviations
+_STACKS_OPEN, _SOURCES_EACH = 4, 32  # stacks that take turns, and the number of sources from each
+_SOURCES_CACHED = 64  # stacks whose sources are kept, as half floats: enough for 16 samples per step
+_STACKS_MEASURED = 24  # used to measure the colours of sources
+_STACKS_CACHED = 2048  # at most 32 KiB each at 512 pixels
+_SUBJECTS_AVERAGED = 16  # enough for the mean position of heads
+_SAME_POSE_SHARE = 0.5  # of samples without pairs
+_DARKEST = 1e-4  # lower bound of a mean radiance that images are divided by
+# The side of the depth map for unwrapping: a multiple of the crop's, up to a limit.
+_DEPTH_PX, _DEPTH_PER_PX = 512, 3
 
 
 @dataclass(frozen=True)
 class CropMove:
-    """A scale about a crop's centre, then a shift (right, down) in units of its side.
+    """Scale about a crop's centre, then shift (right, down) in units of its side.
 
     The crop's camera is fixed: the face moves within the image, as if the box had been another.
     """
@@ -72,7 +74,7 @@ class CropMove:
         if self == UNMOVED:
             return resize(images, side)
         right, down = self.shift
-        # from the moved crop to the given one, in -1..1
+        # from the moved crop to the original one, in -1..1
         back = images.new_tensor([[1, 0, -2 * right], [0, 1, -2 * down]]) / self.scale
         grid = F.affine_grid(back[None].expand(len(images), -1, -1), [len(images), 1, side, side], False)
         small = resize(images, side) if images.shape[-1] > side else images  # averages before it samples
@@ -80,14 +82,6 @@ class CropMove:
 
 
 UNMOVED = CropMove()
-
-
-_STACKS_OPEN, _SOURCES_EACH = 4, 32  # stacks that take turns to give lazy sources, and how many each gives
-_LAZY_CACHED = 64  # stacks' lazy sources, as half floats: that is so for 16 samples of a step
-_STACKS_MEASURED = 24  # whose lazy sources show the colours of all
-_STACKS_CACHED = 2048  # at most 32 KiB each at 512 pixels
-_SUBJECTS_AVERAGED = 16  # enough for the mean position of heads
-_DARKEST = 1e-4  # least mean radiance, so that exposing a black image does not divide by 0
 
 
 @dataclass(frozen=True)
@@ -108,146 +102,176 @@ class CropPairs(Batch):
 
 @dataclass(frozen=True, eq=False)
 class PairReader:
-    """The pairs of one split, read as crops of `side_px`."""
+    """Read pairs of some subjects; without pairs, draw random lights and targets.
+
+    Attributes:
+        side_px: Side of the crops that `draw` and `read` return.
+    """
 
     dataset: Dataset
+    subjects: Sequence[str]
     pairs: list[Pair]
     side_px: int
 
-    def of(self, pairs: list[Pair]) -> "PairReader":
-        """A reader of these pairs."""
-        return replace(self, pairs=pairs)
-
-    @property
-    def _lazy(self) -> bool:
-        return not image_path(self.dataset, *self.pairs[0].key).is_file()
-
     @cached_property
     def _by_stack(self) -> dict[tuple[str, str], list[Pair]]:
-        """The pairs by their source's subject and camera."""
-        found: dict[tuple[str, str], list[Pair]] = defaultdict(list)
+        pairs_of: dict[tuple[str, str], list[Pair]] = defaultdict(list)
         for pair in self.pairs:
-            found[pair.subject, pair.source_camera].append(pair)
-        return found
+            pairs_of[_source_stack(pair)].append(pair)
+        return pairs_of
 
-    def draw(self, count: int, generator_of: Callable[..., torch.Generator], step: int) -> CropPairs:
-        """Read random pairs, each crop as a detector's box would cut it.
+    def draw_source(
+        self, generator_of: Callable[..., torch.Generator], index: int, step: int
+    ) -> tuple[Pair, Tensor]:
+        """Draw the pair of a sample and its source [3, H, W].
 
-        Sample i depends on `generator_of(i)`, and on `generator_of(i, earlier step)`: of lazy pairs the
-        sources of `_SOURCES_EACH` steps come from one stack, and some stacks take turns.
+        They depend on `generator_of(index, earlier step)`: the sources of `_SOURCES_EACH` steps come from
+        one stack, and `_STACKS_OPEN` stacks take turns.
         """
         turn = step // _STACKS_OPEN % _SOURCES_EACH
+        shared = generator_of(index, step - turn * _STACKS_OPEN)
+        pair, source = _cached_sources(self, shared.initial_seed())[turn]
+        return pair, source.float()
+
+    def draw_sources(self, seed: int) -> list[tuple[Pair, Tensor]]:
+        """Draw `_SOURCES_EACH` pairs of one random stack, and their sources [3, H, W] float16."""
+        generator = torch.Generator().manual_seed(seed)
+        if self.pairs:
+            any_pair = self.pairs[int(torch.randint(len(self.pairs), (), generator=generator))]
+            of_stack = self._by_stack[_source_stack(any_pair)]
+            places = torch.randint(len(of_stack), (_SOURCES_EACH,), generator=generator).tolist()
+            pairs = [of_stack[place] for place in places]
+            return list(zip(pairs, self._sum_sources(pairs), strict=True))
+        subject = self.subjects[int(torch.randint(len(self.subjects), (), generator=generator))]
+        cameras = self.dataset.cameras[subject]
+        camera = cameras[int(torch.randint(len(cameras), (), generator=generator))]
+        pairs = [self._draw_target(subject, camera, generator) for _ in range(_SOURCES_EACH)]
+        path = self.dataset.stack_path(subject, camera)
+        directions = stack_info(path).directions
+        weights = torch.stack([draw_light(directions, generator) for _ in pairs])
+        return list(zip(pairs, relit_images(path, weights), strict=True))
+
+    def _draw_target(self, subject: str, camera: str, generator: torch.Generator) -> Pair:
+        """Draw the target of a source whose light no recipe describes."""
+        cameras = self.dataset.cameras[subject]
+        same_pose = torch.rand((), generator=generator) < _SAME_POSE_SHARE
+        other = cameras[int(torch.randint(len(cameras), (), generator=generator))]
+        target = camera if same_pose else other
+        directions = stack_info(self.dataset.stack_path(subject, target)).directions
+        light = int(draw_target_lights(directions, 1, generator))
+        return Pair(subject, 0, self.dataset.split_of(subject), camera, "", 0.0, 0, target, light)
+
+    def _sum_sources(self, pairs: Sequence[Pair]) -> list[Tensor]:
+        """Sum the sources [3, H, W] float16 of pairs of one stack."""
+        rows, weights = load_pairs(self.dataset)[pairs[0].subject]
+        places = {row.index: place for place, row in enumerate(rows)}
+        chosen = torch.from_numpy(np.array(weights[[places[pair.index] for pair in pairs]]))
+        return list(relit_images(self.dataset.stack_path(*_source_stack(pairs[0])), chosen))
+
+    def draw(self, count: int, generator_of: Callable[..., torch.Generator], step: int) -> CropPairs:
+        """Draw random pairs, each crop as a detector's box would cut it (see `Objective.draw`)."""
         drawn = []
-        for i in range(count):
-            generator, source = generator_of(i), None
-            if self._lazy:
-                lazy = generator_of(i, step - turn * _STACKS_OPEN)
-                any_pair = self.pairs[int(torch.randint(len(self.pairs), (), generator=lazy))]
-                of_stack = self._by_stack[any_pair.subject, any_pair.source_camera]
-                chosen = torch.randint(len(of_stack), (_SOURCES_EACH,), generator=lazy).tolist()
-                pairs = tuple(of_stack[place] for place in chosen)
-                pair, source = pairs[turn], _lazy_sources(self.dataset, pairs)[turn].float()
-            else:
-                pair = self.pairs[int(torch.randint(len(self.pairs), (), generator=generator))]
-            drawn.append(self.read(pair, (CropMove.draw(generator), CropMove.draw(generator)), source))
+        for index in range(count):
+            pair, source = self.draw_source(generator_of, index, step)
+            generator = generator_of(index)
+            drawn.append(self._crop(pair, source, CropMove.draw(generator), CropMove.draw(generator)))
         return concatenate(drawn)
 
-    def read(
-        self,
-        pair: Pair,
-        moves: tuple[CropMove, CropMove] = (UNMOVED, UNMOVED),
-        source: Tensor | None = None,
-    ) -> CropPairs:
-        """Read the crops of a pair, B = 1, the source's and the target's moved; its source may be given."""
-        source_stack = _stack_info(self.dataset.stack_path(pair.subject, pair.source_camera))
+    def read(self, pairs: Sequence[Pair]) -> list[CropPairs]:
+        """Read the crops of pairs, B = 1, unmoved; neighbouring pairs of a stack open it once."""
+        return [
+            self._crop(pair, source.float(), UNMOVED, UNMOVED)
+            for _, of_stack in groupby(pairs, _source_stack)
+            for pairs_of_stack in [list(of_stack)]
+            for pair, source in zip(pairs_of_stack, self._sum_sources(pairs_of_stack), strict=True)
+        ]
+
+    def read_target(self, pair: Pair, move: CropMove = UNMOVED) -> Tensor:
+        """Read the target [1, 3, S, S] of a pair, exposed."""
         path = self.dataset.stack_path(pair.subject, pair.target_camera)
-        target_stack = _stack_info(path)
-        source = self._read_source(pair) if source is None else source
-        target = read_olats(path, slice(pair.target_light, pair.target_light + 1))[0].float()
-        if source.shape[-1] != source_stack.side_px or target.shape[-1] != target_stack.side_px:
-            raise InputError(f"{path}: the source has another size than the stack; {DRAW_AGAIN}")
-        exposed = source * (MEAN_RADIANCE / source_stack.colour_on_face(source).mean())
-        moved, moved_target = moves
+        target = read_olats(path, [pair.target_light]).float()
+        return move.image(target * (MEAN_RADIANCE / stack_info(path).lit_mean), self.side_px)
+
+    def _crop(self, pair: Pair, source: Tensor, moved: CropMove, moved_target: CropMove) -> CropPairs:
+        stacks = [
+            stack_info(self.dataset.stack_path(pair.subject, camera))
+            for camera in (pair.source_camera, pair.target_camera)
+        ]
+        exposed = source * (MEAN_RADIANCE / stacks[0].colour_on_face(source).mean())
+        source_px, target_px = (
+            self.side_px * move.points(stack.landmarks_px / stack.side_px)[None]
+            for stack, move in zip(stacks, (moved, moved_target), strict=True)
+        )
         return CropPairs(
             source=moved.image(exposed[None], self.side_px),
-            target=moved_target.image(target[None] * (MEAN_RADIANCE / target_stack.lit_mean), self.side_px),
-            source_landmarks_px=self._landmarks_px(source_stack, moved),
-            target_landmarks_px=self._landmarks_px(target_stack, moved_target),
-            light=target_stack.directions[pair.target_light][None],
+            target=self.read_target(pair, moved_target),
+            source_landmarks_px=source_px,
+            target_landmarks_px=target_px,
+            light=stacks[1].directions[pair.target_light][None],
             people=torch.tensor([self.dataset.subjects.index(pair.subject)]),
         )
 
     def source_colours(self, count: int) -> Tensor:
-        """Mean colours [N, 3] of the face in `count` sources, spread over the pairs."""
-        if self._lazy:
+        """Measure mean colours [N, 3] of the face in about `count` sources, spread over the stacks."""
+        if self.pairs:
             stacks = list(self._by_stack.values())
-            groups = stacks[:: math.ceil(len(stacks) / _STACKS_MEASURED)]
-            chosen = [tuple(pairs[: math.ceil(count / len(groups))]) for pairs in groups]
-            sources = [
-                part
-                for pairs in chosen
-                for part in zip(pairs, _lazy_sources(self.dataset, pairs), strict=True)
-            ]
+            some = stacks[:: math.ceil(len(stacks) / _STACKS_MEASURED)]
+            parts = [pairs[: math.ceil(count / len(some))] for pairs in some]
+            sources = [pair for part in parts for pair in zip(part, self._sum_sources(part), strict=True)]
         else:
-            spread = spread_pairs(self, count, lambda pair: True)
-            sources = [(pair, self._read_source(pair)) for pair in spread]
-        return torch.stack([self._colour(*one) for one in sources])
-
-    def _colour(self, pair: Pair, source: Tensor) -> Tensor:
-        stack = _stack_info(self.dataset.stack_path(pair.subject, pair.source_camera))
-        return stack.colour_on_face(source.float())
-
-    def _landmarks_px(self, stack: "_StackInfo", moved: CropMove) -> Tensor:
-        return moved.points(stack.landmarks_px / stack.side_px)[None] * self.side_px
-
-    def _read_source(self, pair: Pair) -> Tensor:
-        path = image_path(self.dataset, *pair.key)
-        if path.is_file():
-            return torch.from_numpy(read_image(path).pixels).permute(2, 0, 1)
-        return _lazy_sources(self.dataset, (pair,))[0].float()
+            each = math.ceil(count / _STACKS_MEASURED)
+            sources = [pair for seed in range(_STACKS_MEASURED) for pair in self.draw_sources(seed)[:each]]
+        return torch.stack(
+            [
+                stack_info(self.dataset.stack_path(*_source_stack(pair))).colour_on_face(source.float())
+                for pair, source in sources
+            ]
+        )
 
 
-@lru_cache(maxsize=_LAZY_CACHED)  # pairs of a stack follow each other
-def _lazy_sources(dataset: Dataset, pairs: tuple[Pair, ...]) -> list[Tensor]:
-    """Sources [3, H, W] of pairs of one stack, summed from it."""
-    rows, weights = load_pairs(dataset)[pairs[0].subject]
-    places = {row.index: place for place, row in enumerate(rows)}
-    chosen = torch.from_numpy(np.array(weights[[places[pair.index] for pair in pairs]]))
-    stack = dataset.stack_path(pairs[0].subject, pairs[0].source_camera)
-    return list(relit_images(stack, chosen))
+_cached_sources = lru_cache(maxsize=_SOURCES_CACHED)(PairReader.draw_sources)
+
+
+def _source_stack(pair: Pair) -> tuple[str, str]:
+    return pair.subject, pair.source_camera
 
 
 def open_pairs(dataset: Dataset, split: str, side_px: int) -> PairReader:
-    """Open the pairs of a split; raise InputError where it has none or its crops are smaller."""
-    people = set(people_of(dataset, split))
-    pairs = [pair for pair in read_pairs(dataset) if pair.subject in people]
-    if not pairs:
+    """Open the pairs of a split; raise InputError if it has none or its crops are too small."""
+    reader = pairs_of_split(dataset, split, side_px)
+    if not reader.pairs:
         raise InputError(
             f"{dataset.folder}: no pairs in the split {split}; make them with `facerf relight-dataset`"
         )
-    stack = _stack_info(dataset.stack_path(pairs[0].subject, pairs[0].source_camera))
-    require_crops(dataset, stack.side_px, side_px)
-    return PairReader(dataset, pairs, side_px)
+    require_crops(dataset, stack_info(dataset.stack_path(*_source_stack(reader.pairs[0]))).side_px, side_px)
+    return reader
 
 
-def require_crops(dataset: Dataset, found_px: int, side_px: int) -> None:
-    """Raise InputError where a dataset's crops are smaller than the networks need."""
-    if found_px < side_px:
+def pairs_of_split(dataset: Dataset, split: str, side_px: int) -> PairReader:
+    """Open a split, with its pairs if there are any; raise InputError if it has no subjects."""
+    people, rows = people_of(dataset, split), load_pairs(dataset)
+    pairs = [pair for subject in sorted(people) for pair in rows.get(subject, ([],))[0]]
+    return PairReader(dataset, people, pairs, side_px)
+
+
+def require_crops(dataset: Dataset, crop_px: int, side_px: int) -> None:
+    """Raise InputError if a dataset's crops are smaller than the networks need."""
+    if crop_px < side_px:
         raise InputError(
-            f"{dataset.folder}: its crops have {found_px} px, the networks need {side_px}; run "
-            f"prepare-dataset with --crop {side_px}, or train with --texture-size {found_px}"
+            f"{dataset.folder}: its crops have {crop_px} px, the networks need {side_px}; run "
+            f"prepare-dataset with --crop {side_px}, or train with --texture-size {crop_px}"
         )
 
 
 def spread_pairs(reader: PairReader, count: int, wanted: Callable[[Pair], bool]) -> list[Pair]:
     """Choose `count` of the wanted pairs, or all, evenly spread over the subjects; always the same."""
-    found = [pair for pair in reader.pairs if wanted(pair)]
-    places = np.linspace(0, len(found), min(count, len(found)), endpoint=False).astype(int)
-    return [found[place] for place in places]
+    pairs = [pair for pair in reader.pairs if wanted(pair)]
+    places = np.linspace(0, len(pairs), min(count, len(pairs)), endpoint=False).astype(int)
+    return [pairs[place] for place in places]
 
 
 def mean_translation_m(dataset: Dataset) -> tuple[float, float, float]:
-    """Mean head position in the crops' camera over the fits of some subjects.
+    """Return the mean head position in the crops' camera over the fits of some subjects.
 
     A Geometry Network's estimate starts there.
     """
@@ -260,119 +284,55 @@ def mean_translation_m(dataset: Dataset) -> tuple[float, float, float]:
 
 
 @dataclass(frozen=True, eq=False)
-class _StackInfo:
-    """The part of a stack's header that crops need."""
+class StackInfo:
+    """Part of a stack's header that crops need."""
 
     directions: Tensor  # [L, 3] camera space
-    landmarks_px: Tensor  # [68, 2]
-    side_px: int
+    rotation: Tensor  # [3, 3] head_to_camera
+    fit: FaceFit
     lit_mean: float  # mean radiance of the face under a constant map of radiance 1
+    lit_colour: Tensor  # [3], its colour there
     face_bits: np.ndarray  # pixels that show the face, eight to a byte
+
+    @property
+    def side_px(self) -> int:
+        return self.fit.crop.size_px
+
+    @property
+    def landmarks_px(self) -> Tensor:
+        return self.fit.landmarks_px
+
+    @property
+    def face(self) -> Tensor:
+        """Boolean mask [H, W] of the face."""
+        bits = np.unpackbits(self.face_bits, count=self.side_px**2)
+        return torch.from_numpy(bits).view(self.side_px, self.side_px).bool()
 
     def colour_on_face(self, image: Tensor) -> Tensor:
         """Mean colour [3] of the face in an image [3, H, W]."""
-        bits = np.unpackbits(self.face_bits, count=self.side_px**2)
-        face = torch.from_numpy(bits).view(self.side_px, self.side_px).bool()
-        return image[:, face].mean(1).clamp_min(_DARKEST)
+        return image[:, self.face].mean(1).clamp_min(_DARKEST)
 
 
 @lru_cache(maxsize=_STACKS_CACHED)  # every step of training needs some
-def _stack_info(path: Path) -> _StackInfo:
+def stack_info(path: Path) -> StackInfo:
+    """Read what crops need of a stack; raise InputError if it does not show the face."""
     header, fit = read_stack(path)
-    return _StackInfo(
-        directions=torch.from_numpy(header.directions).float(),
-        landmarks_px=fit.landmarks_px,
-        side_px=fit.crop.size_px,
-        lit_mean=lit_mean_of(path, header),
-        face_bits=np.packbits(header.seen > 0.5),
-    )
-
-
-def lit_mean_of(path: Path, header: StackHeader) -> float:
-    """Mean radiance of the face under a constant map of radiance 1; InputError where none is shown."""
     face = header.seen > 0.5
     if not face.any():
         raise InputError(f"{path}: does not show the face; {PREPARE_AGAIN}")
-    return max(float(header.source[face].mean()), _DARKEST)
+    return StackInfo(
+        directions=torch.from_numpy(header.directions).float(),
+        rotation=torch.from_numpy(header.rotation).float(),
+        fit=fit,
+        lit_mean=max(float(header.source[face].mean()), _DARKEST),
+        lit_colour=torch.from_numpy(header.source[face].mean(0)).clamp_min(_DARKEST),
+        face_bits=np.packbits(face),
+    )
 
 
-CACHED_SIDE_PX = 512  # the side of the paper's crops
-log = logging.getLogger(LOGGER_NAME)
-
-
-class _PhotoRecord(Document):
-    landmarks_px: Points68 | None
-
-
-@dataclass(frozen=True)
-class PhotoCrops(Batch):
-    """B crops of photos [B, 3, S, S], scene-linear, and detected landmarks [B, 68, 2] in crop pixels."""
-
-    crops: Tensor
-    landmarks_px: Tensor
-
-
-@dataclass(frozen=True, eq=False)
-class Photos:
-    """Detected faces, drawn as crops of `side_px`."""
-
-    paths: tuple[Path, ...]  # crops in the cache
-    landmarks_px: Tensor  # [N, 68, 2] in crops of `CACHED_SIDE_PX`
-    side_px: int
-
-    def draw(self, generator: torch.Generator) -> PhotoCrops:
-        """Draw a random face, B = 1, its crop as a detector's box would cut it."""
-        place = int(torch.randint(len(self.paths), (), generator=generator))
-        crop = torch.from_numpy(read_image(self.paths[place]).pixels).permute(2, 0, 1)[None]
-        move = CropMove.draw(generator)
-        points = move.points(self.landmarks_px[place] / CACHED_SIDE_PX)
-        return PhotoCrops(move.image(crop, self.side_px), self.side_px * points[None])
-
-
-def open_photos(
-    paths: Iterable[Path], cache: Path, networks: Networks, side_px: int, jobs: int = 1
-) -> Photos:
-    """Open the faces of photos; detect those that are not in `cache`, with a warning for a photo without one.
-
-    Raises InputError where no photo has a face.
-    """
-    records = {path: cache / f"{key_of(_made_from(path, networks))}.json" for path in sorted(paths)}
-    missing = [item for item in records.items() if not item[1].is_file()]
-    if missing:
-        log.info("%s: detecting faces in %d photos (done once)", cache, len(missing))
-        work = partial(_detect, networks)
-        if jobs > 1 and len(missing) > 1:
-            in_shards(work, missing, jobs)
-        else:
-            work(missing)
-    landmarks_px = {
-        record.with_suffix(".jpg"): read_document(record, _PhotoRecord, "delete the folder").landmarks_px
-        for record in records.values()
-    }
-    found = {path: points for path, points in landmarks_px.items() if points is not None}
-    if not found:
-        raise InputError(
-            f"--photos: no face in any of {len(records)} photos; give a folder of photos of faces"
-        )
-    return Photos(tuple(found), torch.from_numpy(np.stack(list(found.values()))).float(), side_px)
-
-
-def _made_from(photo: Path, networks: Networks) -> Recipe:
-    """List all that the crop of a photo's face depends on."""
-    read = [str(photo.absolute()), text_of_state(photo)]
-    return {"photo": read, "parsing": networks.sha256("parsing"), "side": CACHED_SIDE_PX}
-
-
-def _detect(networks: Networks, records: list[tuple[Path, Path]]) -> None:
-    """Write the crop and the record of each photo."""
-    for photo, record in records:
-        landmarks_px = None
-        try:
-            pixels = read_image(photo).pixels
-            face = find_faces(networks.people, pixels, str(photo))[0]
-            crop = from_landmarks(face.landmarks_px, CACHED_SIDE_PX)
-            write_display(record.with_suffix(".jpg"), crop.apply(pixels), "auto")
-            landmarks_px = crop.to_crop(face.landmarks_px).round(3).tolist()
-        except InputError as error:
-            log.warning("%s", error)
-        write_document(record, {"photo": str(photo), "landmarks_px": landmarks_px})
+def unwrap_crops(images: Tensor, vertices: Tensor, side: int) -> tuple[Tensor, Tensor]:
+    """Unwrap crops [B, C, S, S] of meshes [B, V, 3]: textures [B, C, T, T], visibility [B, T, T]."""
+    camera = crop_camera(images.shape[-1])
+    depth_px, samples = min(_DEPTH_PX, _DEPTH_PER_PX * camera.width_px), math.ceil(camera.width_px / side)
+    settings = UnwrapSettings(depth_side_px=depth_px, samples=samples, measured=False)
+    return unwrap(images, vertices, on_device(images.device, grid_triangles), camera, side, settings)

@@ -1,4 +1,4 @@
-"""The prepared dataset on disk (DESIGN, 'Files'): its paths, and reading and writing `dataset.json`.
+"""Paths of a prepared dataset (DESIGN, 'Files'), and the model of its `dataset.json`.
 
     dataset.json               lights, cameras, normalisation, splits, subjects; written last
     findings.jsonl             findings of the capture's checks (`capture/findings.py`)
@@ -8,15 +8,15 @@
     sheets/SUBJECT.jpg, index.html
 
 Lights and cameras in dataset.json are in DESIGN's axes (x right, y up, z toward the camera) and the capture's
-world space; each stack holds its lights in its own crop's camera space. A subject that lacks lights lists
-those it has (`lights`, in the order of its stacks' parts) and why the others are missing (`left_out`).
+world space; each stack contains its lights in its own crop's camera space. A subject without some of the
+lights lists the others (`lights`, in the order of its stacks' parts) and the reasons (`left_out`).
 """
 
 import hashlib
 import json
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -24,7 +24,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from facerf_cli._version import __version__
 from facerf_cli.batch.recipe import Recipe
@@ -34,8 +34,9 @@ from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.fit import FaceFit, fit_from_arrays
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import LAYOUT_VERSION
-from facerf_cli.files.documents import Direction, Document, Name, digest, distinct, read_document
+from facerf_cli.files.documents import Document, Name, checked, digest, distinct
 from facerf_cli.files.olat_stack import StackHeader, read_olat_header
+from facerf_cli.files.texts import read_json
 from facerf_cli.run.logs import LOGGER_NAME
 
 Format = Literal["facerf-dataset-1"]
@@ -45,74 +46,180 @@ SPLITS = ("train", "validation", "test")
 LARGEST_CROP_PX = 4096
 PREPARE_AGAIN = "run prepare-dataset with --overwrite always"
 _COLOUR_SPACE = "lin_rec709"
+_UNIT_TOLERANCE = 1e-3
 log = logging.getLogger(LOGGER_NAME)
 
 
-@dataclass(frozen=True, eq=False)
-class DatasetFolder:
+class DatasetFolder(Document):
     """Paths of a dataset."""
 
-    folder: Path
+    folder: Annotated[Path, Field(exclude=True)]
 
     def stack_path(self, subject: str, camera: str) -> Path:
         return self.folder / "olat" / subject / f"{camera}.exr"
 
     def fit_path(self, subject: str, camera: str) -> Path:
-        """Path of the fit of a subject in a camera's crop."""
+        """Return the path of the fit of a subject in a camera's crop."""
         return self.folder / "fits" / subject / f"{camera}.npz"
 
     def record_path(self, subject: str) -> Path:
-        """Path of a subject's record; it exists once the subject is finished."""
+        """Return the path of a subject's record; it exists once the subject is finished."""
         return self.folder / "fits" / f"{subject}.json"
 
     def sheet_path(self, subject: str) -> Path:
-        """Path of a subject's contact sheet."""
+        """Return the path of a subject's contact sheet."""
         return self.folder / "sheets" / f"{subject}.jpg"
 
 
-@dataclass(frozen=True, eq=False)
-class Dataset(DatasetFolder):
-    """The content of `dataset.json`, without failed subjects."""
+def _unit(direction: list[float]) -> list[float]:
+    if len(direction) != 3 or not abs(np.linalg.norm(direction) - 1) < _UNIT_TOLERANCE:
+        raise ValueError("a vector of length 1 is needed")
+    return direction
 
+
+class RigLight(Document):
+    """Unit vector toward a light, and the position of a near one."""
+
+    id: Name
+    direction_world: Annotated[list[float], AfterValidator(_unit)]
+    position_m: list[float] | None = None
+
+
+class Rig(Document):
+    """Lights of the capture."""
+
+    lights: Annotated[list[RigLight], Field(min_length=1, max_length=MOST_LIGHTS)]
+
+
+class _Subject(Document):
+    """Entries that both descriptions of a prepared subject contain."""
+
+    error_iod: float | None = None
+    quality: str = ""
+    faces_found: int = 0
+    lights: Annotated[list[str], Field(max_length=MOST_LIGHTS)] | None = None  # None: all
+    left_out: dict[str, str] = Field(default_factory=dict)  # reason by light
+    dropped: dict[str, str] = Field(default_factory=dict)  # reason by camera
+    ambient_kept: list[str] = Field(default_factory=list)  # cameras whose ambient image is missing
+
+
+class SubjectEntry(_Subject):
+    """Subject in `dataset.json`; it has stacks unless `status` is "failed"."""
+
+    traits: dict[str, Any] = Field(default_factory=dict)
+    status: str
+    cameras: Annotated[list[Name], Field(max_length=MOST_CAMERAS)] = Field(default_factory=list)
+
+
+class CameraRecord(Document):
+    """Fit of a subject in one camera."""
+
+    face_found: bool
+    error_iod: float
+    quality: str
+    crop_px: int
+    crop_off_iod: float
+
+
+class SubjectRecord(_Subject):
+    """Content of a finished subject's fits/SUBJECT.json."""
+
+    prepared: Recipe = Field(default_factory=dict)  # what the subject was prepared from
+    cameras: dict[Name, CameraRecord]
+    missing: list[str] = Field(default_factory=list)  # "camera/light" of frames that do not exist
+
+
+class Dataset(DatasetFolder):
+    """Folder of a prepared dataset, and the content of its `dataset.json`."""
+
+    format: Format
+    capture: Any = ""  # name of the capture's folder
     face_model: str  # name of the fitted model
-    crop_px: int  # side of the largest crop
-    light_ids: tuple[str, ...]
-    directions_world: np.ndarray  # [L, 3] unit, toward the lights
-    splits: dict[str, tuple[str, ...]]  # by 'train', 'validation' and 'test'
-    cameras: dict[str, tuple[str, ...]]  # of each subject, in a split or not
+    crop_px: Annotated[int, Field(ge=1, le=LARGEST_CROP_PX)]  # side of the largest crop
+    colour_space: str = _COLOUR_SPACE
+    axes: str = ""
+    rig: Rig
+    calibrations: list[dict[str, Any]] = Field(default_factory=list, alias="cameras")
+    normalisation: dict[str, Any] = Field(default_factory=dict)
+    splits: dict[str, Annotated[list[Name], Field(max_length=MOST_SUBJECTS)]]
+    entries: Annotated[dict[Name, SubjectEntry], Field(max_length=MOST_SUBJECTS, alias="subjects")]
     provenance: dict[str, Any]
-    traits: dict[str, dict[str, Any]] = field(default_factory=dict)  # by subject; {} where there are none
-    # Lights of subjects that lack some: indices into light_ids, ascending, of the parts of their stacks.
-    fewer_lights: dict[str, tuple[int, ...]] = field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _is_consistent(self) -> "Dataset":
+        light_ids, done = distinct(self.light_ids, "the light"), self._done
+        for name, subject in done.items():
+            if not distinct(subject.cameras, f"in {name}, the camera"):
+                raise ValueError(f"subject {name} needs at least one camera")
+            lights = light_ids if subject.lights is None else subject.lights
+            if not lights or [light for light in light_ids if light in set(lights)] != lights:
+                raise ValueError(f"subject {name} needs some of the rig's lights, in the rig's order")
+        if missing := [split for split in SPLITS if split not in self.splits]:
+            raise ValueError(f"the split {missing[0]} is missing")
+        members = [name for split in SPLITS for name in self.splits[split]]
+        for name in distinct(members, "in the splits, one split only may hold a subject:"):
+            if name not in done:
+                raise ValueError(f"the splits name {name}, but there is no such prepared subject")
+        return self
+
+    @property
+    def _done(self) -> dict[str, SubjectEntry]:
+        """Subjects that did not fail, sorted."""
+        return {name: entry for name, entry in sorted(self.entries.items()) if entry.status == "done"}
+
+    @cached_property
+    def cameras(self) -> dict[str, tuple[str, ...]]:
+        """Cameras of each prepared subject, in a split or not, sorted by subject."""
+        return {name: tuple(entry.cameras) for name, entry in self._done.items()}
 
     @property
     def subjects(self) -> tuple[str, ...]:
-        """All prepared subjects, sorted."""
+        """Names of the prepared subjects, sorted."""
         return tuple(self.cameras)
 
-    def lights_of(self, subject: str) -> tuple[int, ...]:
-        """Lights of a subject's stacks, in the order of the parts, as indices into `light_ids`."""
-        return self.fewer_lights.get(subject) or tuple(range(len(self.light_ids)))
+    @property
+    def light_ids(self) -> list[str]:
+        return [light.id for light in self.rig.lights]
 
-    def split_of(self, subject: str) -> str:
-        """Split of a subject: 'train', 'validation', 'test', or '' for none."""
-        return self._split_by_subject.get(subject, "")
+    @cached_property
+    def directions_world(self) -> np.ndarray:
+        """Unit vectors [L, 3] toward the lights."""
+        directions = [np.array(light.direction_world) for light in self.rig.lights]
+        return np.array([direction / np.linalg.norm(direction) for direction in directions])
+
+    def lights_of(self, subject: str) -> tuple[int, ...]:
+        """Return the lights of a subject's stacks, in the order of the parts, as indices into `light_ids`."""
+        lights = self.entries[subject].lights
+        if lights is None:
+            return tuple(range(len(self.rig.lights)))
+        places = {name: place for place, name in enumerate(self.light_ids)}
+        return tuple(places[light] for light in lights)
+
+    def traits_of(self, subject: str) -> dict[str, Any]:
+        """Return a subject's traits; {} if the capture lists none."""
+        return self.entries[subject].traits
 
     @cached_property
     def _split_by_subject(self) -> dict[str, str]:
         return {subject: split for split, members in self.splits.items() for subject in members}
 
+    def split_of(self, subject: str) -> str:
+        """Return the split of a subject: 'train', 'validation', 'test', or '' for none."""
+        return self._split_by_subject.get(subject, "")
 
-def people_of(dataset: Dataset, split: str) -> tuple[str, ...]:
-    """Subjects of a split, of whom a training learns ('train') or is judged ('validation').
+    def content(self) -> dict[str, Any]:
+        """Return the content of `dataset.json`."""
+        return self.model_dump(by_alias=True, exclude_unset=True)
 
-    The only person of a dataset is both, and a line says so. Raises InputError where there is nobody.
+
+def people_of(dataset: Dataset, split: str) -> list[str]:
+    """Return the subjects of a split, to train on ('train') or to validate on ('validation').
+
+    If a dataset has only one person, they are used for both, and a warning is logged. Raises InputError for
+    an empty split.
     """
     if split == "validation" and len(dataset.subjects) == 1 and dataset.splits["train"]:
-        log.warning(
-            "%s: has one person, so nobody is held out: the validation is of who is trained on",
-            dataset.folder,
-        )
+        log.warning("%s: only one person: validating on the training data", dataset.folder)
         return dataset.splits["train"]
     if not dataset.splits[split]:
         advice = "run prepare-dataset with another --split"
@@ -120,83 +227,13 @@ def people_of(dataset: Dataset, split: str) -> tuple[str, ...]:
     return dataset.splits[split]
 
 
-class _RigLight(Document):
-    id: Name
-    direction_world: Direction
-
-
-class _Rig(Document):
-    lights: Annotated[list[_RigLight], Field(min_length=1, max_length=MOST_LIGHTS)]
-
-
-class _SubjectEntry(Document):
-    status: str
-    cameras: Annotated[list[Name], Field(max_length=MOST_CAMERAS, default_factory=list)]
-    lights: Annotated[list[str], Field(max_length=MOST_LIGHTS)] | None = None  # None: all
-    traits: dict[str, Any] = Field(default_factory=dict)
-
-
-_Members = Annotated[list[Name], Field(max_length=MOST_SUBJECTS)]
-
-
-class _SplitLists(Document):
-    train: _Members
-    validation: _Members
-    test: _Members
-
-
-class _DatasetDocument(Document):
-    format: Format
-    face_model: str
-    crop_px: Annotated[int, Field(ge=1, le=LARGEST_CROP_PX)]
-    rig: _Rig
-    subjects: Annotated[dict[Name, _SubjectEntry], Field(max_length=MOST_SUBJECTS)]
-    splits: _SplitLists
-    provenance: dict[str, Any]
-
-    @property
-    def done(self) -> dict[str, _SubjectEntry]:
-        """The subjects that did not fail, sorted."""
-        return {name: entry for name, entry in sorted(self.subjects.items()) if entry.status == "done"}
-
-    @model_validator(mode="after")
-    def _is_consistent(self) -> "_DatasetDocument":
-        light_ids = distinct([light.id for light in self.rig.lights], "the light")
-        for name, subject in self.done.items():
-            if not distinct(subject.cameras, f"in {name}, the camera"):
-                raise ValueError(f"subject {name} needs at least one camera")
-            lights = light_ids if subject.lights is None else subject.lights
-            if not lights or [light for light in light_ids if light in set(lights)] != lights:
-                raise ValueError(f"subject {name} needs some of the rig's lights, in the rig's order")
-        members = self.splits.train + self.splits.validation + self.splits.test
-        for name in distinct(members, "in the splits, one split only may hold a subject:"):
-            if name not in self.done:
-                raise ValueError(f"the splits name {name}, which is no prepared subject")
-        return self
-
-
 def read_dataset(folder: Path) -> Dataset:
-    """Read and check `dataset.json`; raise InputError where a stack or fit that it lists is missing."""
-    advice = "make it with `facerf prepare-dataset CAPTURE -o DATASET`"
-    content = read_document(folder / DATASET_FILE, _DatasetDocument, advice)
-    light_ids = tuple(light.id for light in content.rig.lights)
-    places = {name: place for place, name in enumerate(light_ids)}
-    dataset = Dataset(
-        folder=folder,
-        face_model=content.face_model,
-        crop_px=content.crop_px,
-        light_ids=light_ids,
-        directions_world=np.array([light.direction_world for light in content.rig.lights]),
-        splits={split: tuple(getattr(content.splits, split)) for split in SPLITS},
-        cameras={name: tuple(subject.cameras) for name, subject in content.done.items()},
-        provenance=content.provenance,
-        traits={name: subject.traits for name, subject in content.done.items()},
-        fewer_lights={
-            name: tuple(places[light] for light in subject.lights)
-            for name, subject in content.done.items()
-            if subject.lights is not None
-        },
-    )
+    """Read and check `dataset.json`; raise InputError if a stack or fit that it lists is missing."""
+    path = folder / DATASET_FILE
+    content = read_json(path, "make it with `facerf prepare-dataset CAPTURE -o DATASET`")
+    if isinstance(content, dict):
+        content |= {"folder": folder}
+    dataset = checked(Dataset, content, str(path))
     for subject, ids in dataset.cameras.items():
         for camera in ids:
             for path in (dataset.stack_path(subject, camera), dataset.fit_path(subject, camera)):
@@ -206,7 +243,7 @@ def read_dataset(folder: Path) -> Dataset:
 
 
 def read_stack(path: Path) -> tuple[StackHeader, FaceFit]:
-    """Read the header and the fit of a stack; raise InputError where they are no face crop's."""
+    """Read the header and the fit of a stack; raise InputError if it is not a stack of a face crop."""
     header = read_olat_header(path)
     try:
         if header.layout_version != LAYOUT_VERSION or header.kind != "image":
@@ -221,7 +258,7 @@ def read_stack(path: Path) -> tuple[StackHeader, FaceFit]:
 
 @dataclass(frozen=True)
 class Split:
-    """Sizes of training, validation and test: counts of subjects, or shares of all that sum to 1."""
+    """Sizes of training, validation and test: counts of subjects, or fractions that sum to 1."""
 
     parts: tuple[float, float, float]
     are_shares: bool
@@ -230,24 +267,24 @@ class Split:
     def parse(text: str) -> "Split":
         """Parse `300/10/40` or `0.8/0.1/0.1`; raise UsageError for anything else."""
         words = text.split("/")
-        advice = f"--split {text!r}: give counts of subjects such as 300/10/40, or shares such as 0.8/0.1/0.1"
+        advice = f"--split {text!r}: use counts such as 300/10/40, or fractions such as 0.8/0.1/0.1"
         try:
             train, validation, test = (float(word) for word in words)
         except ValueError:
             raise UsageError(advice) from None
         parts, are_shares = (train, validation, test), not all(map(str.isdecimal, words))
         if are_shares and not (min(parts) >= 0 and abs(sum(parts) - 1) < 1e-6):
-            raise UsageError(f"{advice} (shares are not negative and sum to 1)")
+            raise UsageError(f"{advice} (fractions that are not negative and sum to 1)")
         return Split(parts, are_shares)
 
     def counts(self, subjects: int) -> tuple[int, int, int]:
-        """Split a number of subjects; where it is large enough, every share above 0 gets at least one."""
+        """Split a number of subjects; if it is large enough, every fraction above 0 gets at least one."""
         if not self.are_shares:
             train, validation, test = (int(part) for part in self.parts)
             if (wanted := train + validation + test) > subjects:
                 raise UsageError(
                     f"--split {train}/{validation}/{test}: {wanted} subjects, but the capture has "
-                    f"{subjects}; give shares such as 0.8/0.1/0.1"
+                    f"{subjects}; use fractions such as 0.8/0.1/0.1"
                 )
             return train, validation, test
         exact = np.array(self.parts) * subjects
@@ -261,10 +298,10 @@ class Split:
         train, validation, test = counts.tolist()
         return train, validation, test
 
-    def of(self, subjects: Mapping[str, Mapping[str, Any]], seed: int) -> dict[str, tuple[str, ...]]:
-        """Assign subjects, with their traits, to splits, each sorted; those of one "person" stay together.
+    def of(self, subjects: Mapping[str, Mapping[str, Any]], seed: int) -> dict[str, list[str]]:
+        """Assign subjects, with their traits, to splits, each sorted; takes of one "person" stay together.
 
-        The order that is cut into splits depends on each subject's name and the seed alone, so that adding or
+        The order that is cut into splits depends only on each subject's name and the seed, so that adding or
         removing a subject moves few of the others.
         """
         people: dict[str, list[str]] = {}
@@ -274,13 +311,13 @@ class Split:
         ends = np.cumsum([0, *self.counts(len(order))]).tolist()
         parts = (order[first:last] for first, last in pairwise(ends))
         return {
-            split: tuple(sorted(name for person in part for name in people[person]))
+            split: sorted(name for person in part for name in people[person])
             for split, part in zip(SPLITS, parts, strict=True)
         }
 
 
 def preparation(capture: Capture, face_model_sha256: str, crop_px: int | None, network_sha256: str) -> Recipe:
-    """List all that a subject's files depend on besides its images, by the names of options."""
+    """List everything that a subject's files depend on besides its images, by the names of options."""
     calibration = _calibration(capture)
     contents = {
         "face_model": face_model_sha256,
@@ -294,28 +331,33 @@ def preparation(capture: Capture, face_model_sha256: str, crop_px: int | None, n
 
 
 def describe_dataset(
+    folder: Path,
     capture: Capture,
-    records: Mapping[str, Mapping[str, Any]],
+    records: Mapping[str, SubjectRecord],
     split: Split,
     seed: int,
     model: MorphableModel,
     face_model_sha256: str,
-) -> dict[str, Any]:
-    """Make the content of `dataset.json`; subjects without a record are marked as failed."""
+) -> Dataset:
+    """Describe a dataset in a folder; subjects without a record are marked as failed."""
     splits = split.of(capture.subjects, seed)
-    return {
+    entries: dict[str, dict[str, Any]] = {}
+    for subject, traits in capture.subjects.items():
+        entries[subject] = {"traits": traits, "status": "failed"}
+        if record := records.get(subject):
+            known = record.model_dump(exclude={"prepared", "missing"}, exclude_defaults=True)
+            entries[subject] |= {"status": "done", **known, "cameras": list(record.cameras)}
+    content = {
+        "folder": folder,
         "format": FORMAT,
         "capture": capture.folder.resolve().name,
         "face_model": model.name,
-        "crop_px": max(entry["crop_px"] for one in records.values() for entry in one["cameras"].values()),
+        "crop_px": max(camera.crop_px for record in records.values() for camera in record.cameras.values()),
         "colour_space": _COLOUR_SPACE,
         "axes": "x right, y up, z toward the camera; metres; pixel centres at index + 0.5",
         **_calibration(capture),
         "splits": {name: [subject for subject in splits[name] if subject in records] for name in SPLITS},
-        "subjects": {
-            subject: {"traits": traits, **_status(records.get(subject))}
-            for subject, traits in capture.subjects.items()
-        },
+        "subjects": entries,
         "provenance": {
             "software": f"facerf {__version__}",
             "face_model_licence": model.licence,
@@ -324,21 +366,13 @@ def describe_dataset(
             "capture": capture.provenance,
         },
     }
-
-
-def _status(record: Mapping[str, Any] | None) -> dict[str, Any]:
-    if record is None:
-        return {"status": "failed"}
-    known = {name: record[name] for name in ("error_iod", "quality", "faces_found")}
-    optional = ("lights", "left_out", "dropped", "ambient_kept")
-    less = {name: record[name] for name in optional if name in record}
-    return {"status": "done", **known, "cameras": list(record["cameras"]), **less}
+    return checked(Dataset, content, str(folder / DATASET_FILE))
 
 
 def _calibration(capture: Capture) -> dict[str, Any]:
-    """Lights, cameras and the normalisation of the images' values.
+    """Describe lights, cameras and the normalisation of the images' values.
 
-    `preparation` compares all of it: another word here prepares every dataset again.
+    `preparation` compares all of it: if a word here changes, every dataset has to be prepared again.
     """
     lights = [
         {"id": name, "direction_world": direction}
@@ -378,7 +412,7 @@ def _calibration(capture: Capture) -> dict[str, Any]:
 
 
 def provenance_of(dataset: Dataset, model: MorphableModel) -> dict[str, Any]:
-    """Provenance of a dataset, for a checkpoint that was trained on it."""
+    """Return the provenance of a dataset, for a checkpoint that was trained on it."""
     name = dataset.folder.resolve().name
     return {
         "trained_on": f"{name}, {len(dataset.splits['train'])} subjects",
@@ -389,9 +423,9 @@ def provenance_of(dataset: Dataset, model: MorphableModel) -> dict[str, Any]:
 
 
 def _licence(provenance: dict[str, Any], name: str) -> str:
-    """Licence that the dataset or its capture states, or a reference to the dataset."""
-    found = provenance.get("capture")
-    capture = found if isinstance(found, dict) else {}
+    """Return the licence that the dataset or its capture states, or a reference to the dataset."""
+    capture = provenance.get("capture")
+    capture = capture if isinstance(capture, dict) else {}
     if words := provenance.get("licence") or capture.get("licence"):
         return str(words)
     if capture.get("synthetic") is True and "face_model_licence" in capture:  # by `facerf synth-stage`

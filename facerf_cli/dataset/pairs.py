@@ -1,19 +1,19 @@
 """Training pairs (paper, 'Dataset'): a source under an envmap, and one light to predict from it.
 
-    relit/pairs.jsonl         a `Pair` a line, sorted by subject and index
+    relit/pairs.jsonl         one `Pair` per line, sorted by subject and index
     relit/weights-KEY.npy     weights of all rows of pairs.jsonl [rows, L, 3] float32; KEY is its digest
     relit/SUBJECT/NNNNN.exr   the pair's source, unless the pairs are lazy
 
-A pair is a recipe: subject, camera, envmap, rotation, exposure and target. A row of weights holds those of
-its subject's lights, padded with zeros where the subject lacks some of the rig's L. Weights follow from the
-rows and the envmaps, and are computed again where the file is missing.
+A pair is a recipe: subject, camera, envmap, rotation, exposure and target. A row of weights starts with the
+weights of its subject's lights; if the subject lacks some of the rig's L, zeros follow. Weights are computed
+from the rows and the envmaps, and recomputed if the file is missing.
 """
 
 import hashlib
 import logging
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli.dataset.dataset import Dataset
+from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.weights import (
     DEFAULT_MEMORY_BYTES,
     EnvmapTask,
@@ -34,7 +34,6 @@ from facerf_cli.dataset.weights import (
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import checked, digest
-from facerf_cli.files.image_metadata import Attributes
 from facerf_cli.files.olat_stack import read_olat_header
 from facerf_cli.files.texts import parse_json, text_of
 from facerf_cli.files.write import write_exr
@@ -42,16 +41,16 @@ from facerf_cli.run.logs import LOGGER_NAME, attributes_of_sum, json_line
 
 RELIT, PAIRS_NAME = "relit", "pairs.jsonl"
 DRAW_AGAIN = f"move the folder {RELIT} elsewhere and run relight-dataset"
-GIVE_BEFORE = f"give prepare-dataset the --split and --seed of before, or {DRAW_AGAIN}"
-_TEST, _TEST_SAME_SHARE = "test", 0.5  # of the test's pairs, for both rows of the paper's Table 1
+GIVE_BEFORE = f"run prepare-dataset with the previous --split and --seed, or {DRAW_AGAIN}"
+_TEST, _TEST_SAME_SHARE = "test", 0.5  # fraction of the test's pairs, for both rows of Table 1
 log = logging.getLogger(LOGGER_NAME)
 
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """A source under an envmap, and the light of a camera's stack that a network predicts from it.
+    """Source under an envmap, and a target: one light of a camera's stack.
 
-    The source is the stack of `source_camera` summed with the weights of `envmap`, `rotate_deg` added to
+    The source is the stack of `source_camera` summed with the weights of `envmap`, with `rotate_deg` added to
     every azimuth, times 2 to the power of `exposure_ev`, which brings the envmap's mean radiance near 1.
     `envmap` is a file, or procedural:INDEX:SEED:WIDTH for a map of `synth/sky/skies.py`.
     """
@@ -77,7 +76,7 @@ def draw_pairs(
 ) -> list[Pair]:
     """Draw `per_subject` pairs of every subject in a split, sorted, with exposures still 0.
 
-    The split test is lit by `test_maps`, if there are any, all others by `maps`.
+    The split test is lit by `test_maps` if there are any, the others by `maps`.
     """
     of = {_TEST: test_maps or maps}
     placed = sorted(subject for subject in dataset.subjects if dataset.split_of(subject))
@@ -92,7 +91,7 @@ def draw_pair(dataset: Dataset, maps: Sequence[str], seed: int, subject: str, in
     """Draw one pair; it depends on (seed, subject, index), the subject's cameras and lights, and `maps`.
 
     The target's camera is any of the subject's (paper, 'Dataset': 'from a random camera view'); in the split
-    test it is the source's in half of the pairs.
+    test, half of the pairs have the source's.
     """
     name = int.from_bytes(hashlib.sha256(subject.encode()).digest()[:8], "little")
     random = np.random.default_rng([seed, name, index])
@@ -119,12 +118,12 @@ def pairs_path(dataset: Dataset) -> Path:
 
 
 def image_path(dataset: Dataset, subject: str, index: int) -> Path:
-    """Path of the source of a subject's pair."""
+    """Return the path of the source of a subject's pair."""
     return dataset.folder / RELIT / subject / f"{index:05d}.exr"
 
 
 def read_pairs(dataset: Dataset) -> list[Pair]:
-    """Read all pairs of a dataset, none where it has none; raise InputError where they do not fit it."""
+    """Read all pairs of a dataset, if any; raise InputError if they do not fit it."""
     path = pairs_path(dataset)
     pairs: list[Pair] = []
     if not path.is_file():
@@ -132,7 +131,11 @@ def read_pairs(dataset: Dataset) -> list[Pair]:
     for number, line in enumerate(text_of(path.read_bytes(), "replace").splitlines(), 1):
         try:
             pair = checked(Pair, parse_json(line), f"line {number}")
-            check_pair(dataset, pair)
+            known = {pair.source_camera, pair.target_camera} <= set(dataset.cameras[pair.subject])
+            if not known or pair.split != dataset.split_of(pair.subject):
+                raise ValueError("another camera or split")
+            if not 0 <= pair.target_light < len(dataset.lights_of(pair.subject)):
+                raise ValueError("no such light")
             if pairs and pair.key <= pairs[-1].key:
                 raise ValueError("not sorted, or repeated")
         except (ValueError, KeyError, InputError):
@@ -143,21 +146,11 @@ def read_pairs(dataset: Dataset) -> list[Pair]:
     return pairs
 
 
-def check_pair(dataset: Dataset, pair: Pair) -> None:
-    """Raise KeyError or ValueError where a pair does not fit the dataset."""
-    if not {pair.source_camera, pair.target_camera} <= set(dataset.cameras[pair.subject]):
-        raise ValueError("unknown camera")
-    if pair.split != dataset.split_of(pair.subject):
-        raise ValueError("wrong split")
-    if not 0 <= pair.target_light < len(dataset.lights_of(pair.subject)):
-        raise ValueError("number out of range")
-
-
 def write_pairs(dataset: Dataset, drawn: list[Pair], overwrite: bool, spread: Spread = map) -> list[Pair]:
     """Write pairs.jsonl and the weights of newly drawn pairs; return the pairs with their exposures.
 
-    Existing pairs stay where they agree, so that a larger number adds pairs; every existing image must belong
-    to a pair that stays. `overwrite` removes old pairs and images once the new weights are computed.
+    Existing pairs must agree, so that a larger number adds pairs, and every existing image must belong to one
+    that is kept. `overwrite` removes old pairs and images once the new weights are computed.
     """
     if not overwrite:
         old = read_pairs(dataset)
@@ -166,12 +159,12 @@ def write_pairs(dataset: Dataset, drawn: list[Pair], overwrite: bool, spread: Sp
             return old
         _require_agreement(dataset, before, drawn)
     weights, pairs = compute_pair_weights(dataset, drawn, spread)
-    if overwrite:  # pairs first: then a killed run leaves no image that passes for a new pair's
+    if overwrite:  # pairs first: a killed run leaves no image that could be mistaken for a new pair's
         pairs_path(dataset).unlink(missing_ok=True)
         for path in _images(dataset):
             path.unlink()
     else:
-        _require_agreement(dataset, old, pairs)  # now the exposures, too: the envmaps may have changed
+        _require_agreement(dataset, old, pairs)  # also the exposures: the envmaps may have changed
     text = "".join(json_line(asdict(pair)) + "\n" for pair in pairs)
     _write_weights(dataset, weights, text.encode())
     with atomic_path(pairs_path(dataset)) as temporary:
@@ -180,14 +173,14 @@ def write_pairs(dataset: Dataset, drawn: list[Pair], overwrite: bool, spread: Sp
 
 
 def _require_agreement(dataset: Dataset, old: list[Pair], new: list[Pair]) -> None:
-    """Raise UsageError where common pairs differ, or an image belongs to no common pair."""
+    """Raise UsageError if common pairs differ, or an image belongs to no common pair."""
     known = {pair.key: pair for pair in old}
     both = [pair for pair in new if pair.key in known]
     explained = {image_path(dataset, *pair.key) for pair in both}
     if any(known[pair.key] != pair for pair in both) or not explained.issuperset(_images(dataset)):
         raise UsageError(
-            f"{dataset.folder / RELIT}: holds images of another seed, other envmaps, another dataset or a "
-            f"larger --per-subject; give those options again, or {DRAW_AGAIN}"
+            f"{dataset.folder / RELIT}: contains images of another seed, other envmaps, another dataset or "
+            f"a larger --per-subject; use those options, or {DRAW_AGAIN}"
         )
 
 
@@ -195,17 +188,14 @@ def _images(dataset: Dataset) -> list[Path]:
     return list((dataset.folder / RELIT).glob("*/[0-9]*.exr"))
 
 
-def weights_path(dataset: Dataset) -> Path:
-    """Path of the weights of the present pairs."""
-    return _weights_path(dataset, pairs_path(dataset).read_bytes())
-
-
-def _weights_path(dataset: Dataset, pairs_text: bytes) -> Path:
-    return dataset.folder / RELIT / f"weights-{digest(pairs_text)}.npy"
+def weights_path(dataset: Dataset, pairs_text: bytes | None = None) -> Path:
+    """Return the path of the weights of pairs.jsonl, or of a new text of it."""
+    text = pairs_path(dataset).read_bytes() if pairs_text is None else pairs_text
+    return dataset.folder / RELIT / f"weights-{digest(text)}.npy"
 
 
 def _write_weights(dataset: Dataset, weights: np.ndarray, pairs_text: bytes) -> None:
-    path = _weights_path(dataset, pairs_text)
+    path = weights_path(dataset, pairs_text)
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         np.save(file, weights)
     for old in path.parent.glob("weights-*.npy"):
@@ -214,36 +204,27 @@ def _write_weights(dataset: Dataset, weights: np.ndarray, pairs_text: bytes) -> 
 
 
 def load_pairs(dataset: Dataset) -> dict[str, tuple[list[Pair], np.ndarray]]:
-    """Each subject's pairs and their weights [rows, L, 3] float32, memory-mapped; L are the subject's lights.
+    """Load each subject's pairs and weights [rows, L, 3] float32, memory-mapped, of the subject's L lights.
 
-    Weights include the exposures. Empty where the dataset has no pairs. The result is cached until
+    Weights include the exposures. The result is empty for a dataset without pairs; it is cached until
     pairs.jsonl changes.
     """
     path = pairs_path(dataset)
-    if not path.is_file():
-        return {}
-    return _load_pairs(_ByFolder(dataset, dataset.folder.absolute()), path.stat().st_mtime_ns)
-
-
-@dataclass(frozen=True)
-class _ByFolder:
-    """A dataset as a cache key."""
-
-    dataset: Dataset = field(compare=False)
-    folder: Path
+    return _load_pairs(dataset.folder.absolute(), path.stat().st_mtime_ns) if path.is_file() else {}
 
 
 @lru_cache(maxsize=1)  # large tables, one dataset at a time
-def _load_pairs(key: _ByFolder, changed_ns: int) -> dict[str, tuple[list[Pair], np.ndarray]]:
-    pairs = read_pairs(key.dataset)
-    weights = _load_weights(key.dataset, pairs)
+def _load_pairs(folder: Path, changed_ns: int) -> dict[str, tuple[list[Pair], np.ndarray]]:
+    dataset = read_dataset(folder)
+    pairs = read_pairs(dataset)
+    weights = _load_weights(dataset, pairs)
     rows_of: dict[str, list[int]] = defaultdict(list)
     for row, pair in enumerate(pairs):
         rows_of[pair.subject].append(row)
     return {
         subject: (
             pairs[rows[0] : rows[-1] + 1],
-            weights[rows[0] : rows[-1] + 1, : len(key.dataset.lights_of(subject))],
+            weights[rows[0] : rows[-1] + 1, : len(dataset.lights_of(subject))],
         )
         for subject, rows in rows_of.items()
     }
@@ -252,7 +233,7 @@ def _load_pairs(key: _ByFolder, changed_ns: int) -> dict[str, tuple[list[Pair], 
 def _load_weights(dataset: Dataset, pairs: list[Pair]) -> np.ndarray:
     path = weights_path(dataset)
     if not path.is_file():
-        log.info("%s: missing; computing the weights again", path)
+        log.info("%s: missing; recomputing the weights", path)
         weights, computed = compute_pair_weights(dataset, pairs)
         if computed != pairs:
             raise InputError(
@@ -264,7 +245,7 @@ def _load_weights(dataset: Dataset, pairs: list[Pair]) -> np.ndarray:
         if weights.shape != (len(pairs), len(dataset.light_ids), 3) or weights.dtype != np.float32:
             raise ValueError(f"shape {weights.shape}")
     except (ValueError, OSError, EOFError) as error:
-        raise InputError(f"{path}: damaged ({error}); delete it to have it computed again") from None
+        raise InputError(f"{path}: damaged ({error}); delete it, and it is recomputed") from None
     return weights
 
 
@@ -286,25 +267,25 @@ def compute_pair_weights(
         for name, rows in rows_of.items()
     ]
     weights = np.zeros((len(pairs), len(directions), 3), np.float32)
-    exposed, complaints = list(pairs), []
+    exposed, errors = list(pairs), []
     for rows, result in zip(rows_of.values(), spread(compute_weights, tasks), strict=True):
         if isinstance(result, str):
-            complaints.append(result)
+            errors.append(result)
             continue
         weights[rows] = result.weights
         for row in rows:
             exposed[row] = replace(pairs[row], exposure_ev=result.exposure_ev)
-    if complaints:
-        for complaint in complaints:
-            log.error("%s", complaint)
+    if errors:
+        for error in errors:
+            log.error("%s", error)
         raise FacerfError(  # without them, pairs would differ from those of the complete folder
-            f"--envmaps: {len(complaints)} of {len(tasks)} maps cannot be used; repair or remove them"
+            f"--envmaps: {len(errors)} of {len(tasks)} maps cannot be used; repair or remove them"
         )
     return weights, exposed
 
 
 def pair_weights(dataset: Dataset, pair: Pair) -> Tensor:
-    """Compute the weights [L, 3] of one pair from its envmap; they equal those of `load_pairs`."""
+    """Compute the weights [L, 3] of one pair from its envmap; they equal the ones from `load_pairs`."""
     lights = dataset.lights_of(pair.subject)
     result = compute_weights(EnvmapTask(pair.envmap, map_directions(dataset), (pair.rotate_deg,), (lights,)))
     if isinstance(result, str):
@@ -321,7 +302,7 @@ def relight_subject(
     memory_bytes: int = DEFAULT_MEMORY_BYTES,
     overwrite: bool = False,
 ) -> int:
-    """Write the missing sources of a subject's pairs, with weights [rows, L, 3]; return how many."""
+    """Write the missing sources of a subject's pairs, with weights [rows, L, 3]; return their number."""
     todo = [row for row, pair in enumerate(pairs) if overwrite or not image_path(dataset, *pair.key).exists()]
     for camera in sorted({pairs[row].source_camera for row in todo}):
         rows = [row for row in todo if pairs[row].source_camera == camera]
@@ -329,18 +310,14 @@ def relight_subject(
         images = relit_images(path, torch.from_numpy(np.array(weights[rows])), memory_bytes)
         attributes = attributes_of_sum(read_olat_header(path).metadata)
         for row, image in zip(rows, images, strict=True):
-            write_source(image_path(dataset, *pairs[row].key), pairs[row], image, attributes)
+            recipe = {f"facerf:{name}": value for name, value in asdict(pairs[row]).items()}
+            pixels = image.permute(1, 2, 0).float().numpy()
+            write_exr(image_path(dataset, *pairs[row].key), pixels, metadata={**attributes, **recipe})
     return len(todo)
 
 
-def write_source(path: Path, pair: Pair, image: Tensor, attributes: Attributes) -> None:
-    """Write the source [3, H, W] of a pair, with the pair and attributes as metadata."""
-    recipe = {f"facerf:{name}": value for name, value in asdict(pair).items()}
-    write_exr(path, image.permute(1, 2, 0).float().numpy(), metadata={**attributes, **recipe})
-
-
 def render_source(dataset: Dataset, row: Pair | Mapping[str, Any]) -> Tensor:
-    """Render the source [3, H, W] float16 of a line of pairs.jsonl from the dataset and the envmap alone.
+    """Render the source [3, H, W] float16 of a line of pairs.jsonl from only the dataset and the envmap.
 
     The result equals the file that `relight-dataset` writes, bit for bit.
     """

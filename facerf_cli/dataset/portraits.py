@@ -1,10 +1,11 @@
-"""Portraits of a prepared dataset, which the stage portrait trains on in place of synthetic people.
+"""Portraits of a prepared dataset; the stage `portrait` trains on them in place of synthetic people.
 
-    portraits-192/SUBJECT/CAMERA.safetensors   OLATs of a stack and what is seen in it; empty without a face
+    portraits-192/SUBJECT/CAMERA.safetensors   OLATs of a stack and their analysis; empty without a face
 
-A view is treated as a user's photo of its crop would be: the person is found, fitted and segmented in the
-fully lit image, and all of it is kept in the square that the Portrait Network sees. Nobody knows the albedo,
-normals and classes of real people: the fully lit image stands for the albedo, what is seen for the classes.
+A view is processed like a user's photo of its crop: the person is found, fitted and segmented in the fully
+lit image, and the result is stored in the square that the Portrait Network sees. The albedo, normals and
+classes of real people are unknown: the fully lit image replaces the albedo, the predicted classes the true
+ones.
 """
 
 import logging
@@ -21,11 +22,11 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from facerf_cli.batch.recipe import is_made_from
+from facerf_cli.batch.recipe import is_made_from, text_of_state
 from facerf_cli.dataset.dataset import Dataset, people_of, provenance_of, read_dataset
-from facerf_cli.dataset.unwrapped import stamp
 from facerf_cli.errors import InputError
 from facerf_cli.face.morphable import load_face_model
+from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.olat_stack import read_olat_header, read_olats
 from facerf_cli.files.write import HALF_MAX
@@ -43,22 +44,22 @@ from facerf_cli.synth.bank.portrait_samples import (
 from facerf_cli.synth.bank.texture_samples import draw_target_lights
 from facerf_cli.synth.bank.transport import layers_of, person_in
 
-_AROUND = 48  # lights of the rig all around whose shadows are summarised, as of photos
+_AROUND = 48  # lights from all directions whose shadows are summarised, as for photos
 log = logging.getLogger(LOGGER_NAME)
 
 
 @dataclass(frozen=True, eq=False)
 class DatasetPortraits:
-    """A prepared dataset and its portraits, a `PortraitSource`; its people are indices of `views`."""
+    """Prepared dataset and its portraits, a `PortraitSource`; people are indices of `views`."""
 
     dataset: Dataset
     views: list[list[Path]]  # of each person in the split train or validation, those that show a face
-    training: int  # the first people, which are those of the split train
+    training: int  # number of people of the split train, which come first
     backgrounds: Tensor
     provenance: dict[str, Any]
 
     def people(self, held_out: int) -> tuple[list[int], list[int]]:
-        """Indices of the people of the split train, and of at most `held_out` of the split validation."""
+        """Return indices of the people of the split train, and of at most `held_out` of validation."""
         everyone = list(range(len(self.views)))
         return everyone[: self.training], everyone[self.training :][:held_out]
 
@@ -69,7 +70,7 @@ class DatasetPortraits:
     def draw(
         self, people: Sequence[int], targets: int, generator: torch.Generator, side_px: int | None = None
     ) -> PortraitSample:
-        """Draw one sample [1, ...] of one of some people, with `targets` lights."""
+        """Draw a sample [1, ...] of one of the people, with `targets` lights."""
         views = self.views[people[int(torch.randint(len(people), (), generator=generator))]]
         seen = load_file(views[int(torch.randint(len(views), (), generator=generator))])
         rig, olats, classes = seen["directions"], seen["olats"], seen["classes"].float() / 255
@@ -96,7 +97,7 @@ def open_dataset_portraits(
 ) -> DatasetPortraits:
     """Open the dataset in a folder, and make missing portraits of its splits train and validation.
 
-    Raises InputError where a split has nobody whose face is found.
+    Raises InputError if no face is found in a split.
     """
     dataset = read_dataset(folder)
     people = {split: people_of(dataset, split) for split in ("train", "validation")}
@@ -137,13 +138,14 @@ def _make_missing(dataset: Dataset, networks: Networks, jobs: int) -> None:
     ]
     if missing:
         folder = dataset.folder / f"portraits-{SIDE_PX}"
-        log.info("%s: looking at the people of %d stacks (done once)", folder, len(missing))
+        log.info("%s: analysing the people of %d stacks (done once)", folder, len(missing))
         in_shards(partial(_make_shard, dataset, networks), missing, jobs)
 
 
 def _made_from(dataset: Dataset, networks: Networks, subject: str, camera: str) -> str:
-    """The stamp of a portrait: of its stack, and of the network that looks at the person."""
-    return f"{stamp(dataset, subject, camera)}-{networks.sha256('parsing')}"
+    """Return text that changes if the stack or the network that analyses the person changes."""
+    stack = text_of_state(dataset.stack_path(subject, camera))
+    return f"{LAYOUT_VERSION}-{stack}-{networks.sha256('parsing')}"
 
 
 def _make_shard(dataset: Dataset, networks: Networks, views: list[tuple[str, str]]) -> None:
@@ -158,7 +160,7 @@ def _make_shard(dataset: Dataset, networks: Networks, views: list[tuple[str, str
 
 @torch.no_grad()
 def _portrait_of(networks: Networks, stack: Path) -> dict[str, Tensor]:
-    """Look at the person of a stack; raises InputError where no face is found.
+    """Analyse the person of a stack; raise InputError if no face is found.
 
     olats [L, 3, S, S], lit [3, S, S] and inside [S, S], where the crop lies: float16; directions [L, 3];
     around uint8 [48, s, s], the visibility of `around_directions`; the layers of `layers_of`.

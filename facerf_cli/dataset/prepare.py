@@ -1,8 +1,8 @@
 """Prepare one subject of a capture: landmarks, one head fit, crops, OLAT stacks and a contact sheet.
 
-Images are read one by one, twice: for the fully lit sum on which the face is detected, and for the stack. At
-most one camera's sum is in memory. A `Selection` gives the lights and cameras to use; a camera that does not
-see the face is left out as well. `index_page` shows all subjects: each one's sheet, split, fit and findings.
+Images are read one at a time, twice: for the fully lit sum that the face is detected in, and for the stack.
+At most one camera's sum is in memory. A `Selection` lists the lights and cameras to use; a camera that does
+not see the face is also left out. `index_page` shows each subject's sheet, split, fit and findings.
 """
 
 import logging
@@ -19,7 +19,7 @@ from torch import Tensor
 from facerf_cli.batch.recipe import Recipe
 from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.findings import Finding, Selection
-from facerf_cli.dataset.dataset import DatasetFolder
+from facerf_cli.dataset.dataset import CameraRecord, Dataset, DatasetFolder, SubjectRecord
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import (
@@ -35,7 +35,7 @@ from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
 from facerf_cli.face.view import draw_fit
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.documents import Document, Name, read_document, write_document
+from facerf_cli.files.documents import read_document, write_document
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
 from facerf_cli.files.sheets import contact_sheet, filled_page, mark_light
 from facerf_cli.files.write import HALF_MAX, write_display
@@ -54,21 +54,17 @@ _DIMMEST = 1e-3  # largest radiance under a constant map of 1 below which half f
 log = logging.getLogger(LOGGER_NAME)
 
 
-class _SubjectRecord(Document):
-    cameras: dict[Name, Any]
-
-
 def subject_outputs(capture: Capture, subject: str, dataset: DatasetFolder) -> list[Path]:
-    """All files of a subject, from its record if it has one; the last one is written last."""
+    """List all files of a subject, from its record if it has one; the last one is written last."""
     record = dataset.record_path(subject)
-    cameras = read_document(record, _SubjectRecord, "").cameras if record.exists() else capture.cameras
+    cameras = read_document(record, SubjectRecord, "").cameras if record.exists() else capture.cameras
     paths = [of(subject, camera) for camera in cameras for of in (dataset.stack_path, dataset.fit_path)]
     return [*paths, dataset.sheet_path(subject), record]
 
 
 @dataclass(frozen=True, eq=False)
 class Preparation:
-    """All that subjects are prepared with; `networks` find the faces."""
+    """Settings that all subjects are prepared with; `networks` find the faces."""
 
     model: MorphableModel
     networks: Networks
@@ -78,7 +74,7 @@ class Preparation:
     strict: bool = False  # a camera that does not see the face is an error
 
 
-def prepare_subject(capture: Capture, subject: str, chosen: Selection, how: Preparation) -> dict[str, Any]:
+def prepare_subject(capture: Capture, subject: str, chosen: Selection, how: Preparation) -> SubjectRecord:
     """Write a subject's stacks, fits, sheet and record, and return the record."""
     how.dataset.record_path(subject).unlink(missing_ok=True)
     person = _Subject(capture, subject, chosen.lights, how)
@@ -91,7 +87,8 @@ def prepare_subject(capture: Capture, subject: str, chosen: Selection, how: Prep
     middle_m = head.vertices(how.model)[0].mean(0).numpy()
     person = replace(person, capture=capture.about(middle_m))
     mean_error_iod = float(np.nanmean(errors_iod))
-    cameras, rows, dropped = {}, [], dict(chosen.dropped)
+    cameras: dict[str, CameraRecord] = {}
+    rows, dropped = [], dict(chosen.dropped)
     for camera, landmarks_px, error_iod in zip(chosen.cameras, landmarks, errors_iod.tolist(), strict=True):
         lost = math.isnan(error_iod)  # landmarks are missing or rejected
         seen_px, error_iod = (None, mean_error_iod) if lost else (landmarks_px, error_iod)
@@ -104,33 +101,37 @@ def prepare_subject(capture: Capture, subject: str, chosen: Selection, how: Prep
             dropped[camera] = str(error)
             continue
         rows.append(_write_camera(person, camera, fit, header))
-        cameras[camera] = {
-            "face_found": seen_px is not None,
-            "error_iod": round(fit.error_iod, 5),
-            "quality": fit.quality,
-            "crop_px": fit.crop.size_px,
-            "crop_off_iod": round(off_iod, 5),
-        }
+        cameras[camera] = CameraRecord(
+            face_found=seen_px is not None,
+            error_iod=round(fit.error_iod, 5),
+            quality=fit.quality,
+            crop_px=fit.crop.size_px,
+            crop_off_iod=round(off_iod, 5),
+        )
     chosen = replace(chosen, dropped=dropped)
     _remove_dropped(subject, chosen, how, bool(cameras))
     sheet = contact_sheet(np.concatenate(rows), len(rows[0]))
     write_display(how.dataset.sheet_path(subject), sheet, metadata=person.provenance())
-    record = {
-        "prepared": how.made_from,
-        "error_iod": round(mean_error_iod, 5),
-        "quality": quality_of(mean_error_iod),
-        "faces_found": sum(entry["face_found"] is True for entry in cameras.values()),
-        "cameras": cameras,
-        **_optional_entries(person, chosen),
-    }
-    write_document(how.dataset.record_path(subject), record)
+    record = SubjectRecord(
+        prepared=how.made_from,
+        error_iod=round(mean_error_iod, 5),
+        quality=quality_of(mean_error_iod),
+        faces_found=sum(entry.face_found for entry in cameras.values()),
+        cameras=cameras,
+        dropped=chosen.dropped,
+        missing=list(chosen.missing),
+        lights=[capture.light_ids[light] for light in chosen.lights] if chosen.left_out else None,
+        left_out=chosen.left_out,
+        ambient_kept=_ambient_kept(person, chosen.cameras),
+    )
+    write_document(how.dataset.record_path(subject), record.model_dump(exclude_defaults=True))
     return record
 
 
-def prepared_subjects(capture: Capture, dataset: DatasetFolder) -> dict[str, dict[str, Any]]:
-    """Records of the finished subjects, by subject; 'prepared' is what they were made from."""
+def prepared_subjects(capture: Capture, dataset: DatasetFolder) -> dict[str, SubjectRecord]:
+    """Read the records of the finished subjects, by subject."""
     return {
-        subject: read_document(dataset.record_path(subject), dict[str, Any], "")
+        subject: read_document(dataset.record_path(subject), SubjectRecord, "")
         for subject in capture.subjects
         if all(path.exists() for path in subject_outputs(capture, subject, dataset))
     }
@@ -138,7 +139,7 @@ def prepared_subjects(capture: Capture, dataset: DatasetFolder) -> dict[str, dic
 
 @dataclass(frozen=True, eq=False)
 class _Subject:
-    """A subject of a capture, and the lights of their stacks (indices into the capture's)."""
+    """Subject of a capture, and the lights of their stacks (indices into the capture's)."""
 
     capture: Capture
     name: str
@@ -147,11 +148,11 @@ class _Subject:
 
     @property
     def directions_world(self) -> np.ndarray:
-        """Unit vectors toward the lights [L, 3]."""
+        """Unit vectors [L, 3] toward the lights."""
         return self.capture.directions_world[list(self.lights)]
 
     def provenance(self, *camera: str) -> dict[str, str | int]:
-        """Metadata of files made from their images, marked as synthetic where the capture is."""
+        """Return metadata for files made from their images, marked as synthetic if the capture is."""
         synthetic = self.capture.provenance.get("synthetic") is True
         source_type = COMPUTER_GRAPHICS_SOURCE_TYPE if synthetic else ""
         name = "/".join([self.name, *camera])
@@ -159,7 +160,7 @@ class _Subject:
 
 
 def _remove_dropped(subject: str, chosen: Selection, how: Preparation, any_left: bool) -> None:
-    """Log what is left out and delete an earlier run's files of it; raise where that is not allowed."""
+    """Log what is left out and delete its files of an earlier run; raise InputError if not allowed."""
     if chosen.dropped and (how.strict or not any_left):
         reasons = "; ".join(f"{camera}: {why}" for camera, why in chosen.dropped.items())
         advice = "without --strict the other cameras are used" if any_left else "no camera is left"
@@ -171,21 +172,8 @@ def _remove_dropped(subject: str, chosen: Selection, how: Preparation, any_left:
         how.dataset.fit_path(subject, camera).unlink(missing_ok=True)
 
 
-def _optional_entries(person: _Subject, chosen: Selection) -> dict[str, Any]:
-    """Entries of a record that it has where they are not empty: missing and uncorrected frames."""
-    capture = person.capture
-    entries = {
-        "dropped": chosen.dropped,
-        "missing": list(chosen.missing),
-        "lights": [capture.light_ids[light] for light in chosen.lights] if chosen.left_out else [],
-        "left_out": chosen.left_out,
-        "ambient_kept": _ambient_kept(person, chosen.cameras),
-    }
-    return {name: entry for name, entry in entries.items() if entry}
-
-
 def _ambient_kept(person: _Subject, cameras: Iterable[str]) -> list[str]:
-    """Cameras whose ambient image should be subtracted but is missing; logs a warning for them."""
+    """List cameras whose ambient image should be subtracted but is missing, and log a warning."""
     if not person.capture.subtract_ambient:
         return []
     without = [camera for camera in cameras if person.capture.ambient(person.name, camera) is None]
@@ -196,7 +184,7 @@ def _ambient_kept(person: _Subject, cameras: Iterable[str]) -> list[str]:
 
 
 def _find_landmarks(person: _Subject, camera: str) -> np.ndarray | None:
-    """Detect landmarks [68, 2] on the fully lit sum, in the camera's pixels; None where there is no face."""
+    """Detect landmarks [68, 2] in the fully lit sum, in the camera's pixels; None without a face."""
     weights = constant_weights(person.directions_world)
     posed = person.capture.cameras[camera]
     lit = np.zeros((posed.height_px, posed.width_px, 3), np.float32)
@@ -207,7 +195,7 @@ def _find_landmarks(person: _Subject, camera: str) -> np.ndarray | None:
 
 
 def constant_weights(directions: np.ndarray) -> np.ndarray:
-    """Weights [L] of lights [L, 3] under a constant map of radiance 1: their cells' solid angles / pi."""
+    """Return weights [L] of lights [L, 3] under a constant map of radiance 1: their solid angles / pi."""
     white = torch.ones(2, 4, 3)
     return envmap_weights(white, torch.from_numpy(directions).float())[:, 0].numpy()
 
@@ -246,7 +234,7 @@ def stack_header(
 def _header(person: _Subject, camera: str, head: Heads, fit: FaceFit) -> StackHeader:
     """Make the header of a camera's stack with a black source; raise InputError where it sees no face."""
     posed = person.capture.cameras[camera]
-    # World to crop by way of the head, so that lights turn with the normals.
+    # World to crop through the head, so that lights rotate with the normals.
     world_to_crop = fit.rotation.double() @ head.rotation[0].mT
     directions = person.directions_world @ world_to_crop.numpy().T
     source = np.zeros((fit.crop.size_px, fit.crop.size_px, 3), np.float32)
@@ -285,7 +273,7 @@ def _crops(
         if place in sheet_images:
             sheet_images[place] = image
         yield torch.from_numpy(image).permute(2, 0, 1)[None]
-    # Under a constant map of 1 a face is below 1; what leaves the range of half floats is warned of.
+    # Under a constant map of 1 a face is below 1; warn about values outside the range of half floats.
     name, lit = f"{person.name}/{camera}", float(header.source.max())
     np.minimum(header.source, HALF_MAX, out=header.source)
     if clipped:
@@ -297,38 +285,33 @@ def _crops(
 
 
 def index_page(
-    dataset: Mapping[str, Any],
-    records: Mapping[str, Mapping[str, Any]],
-    findings: Mapping[str, Sequence[Finding]],
+    dataset: Dataset, records: Mapping[str, SubjectRecord], findings: Mapping[str, Sequence[Finding]]
 ) -> str:
-    """Make the page from the content of `dataset.json`, the records of finished subjects and the findings."""
+    """Return the HTML page of a dataset: the records of finished subjects and the findings."""
+    template = Path(__file__).with_name("index.html")
     return filled_page(
-        Path(__file__).with_name("index.html"),
-        dataset=dataset,
-        records=records,
-        findings=findings,
-        split_of={name: split for split, names in dataset["splits"].items() for name in names},
+        template, dataset=dataset, records=records, findings=findings, split_of=dataset.split_of
     )
 
 
 def sheet_lights(directions: np.ndarray) -> list[int]:
-    """Indices of the sheet's three lights: those nearest to front, left and right; directions [L, 3]."""
+    """Return indices of the sheet's three lights, nearest to front, left and right; directions [L, 3]."""
     wanted = np.stack([azel_to_direction(*azel).numpy() for azel in _SHEET_AZEL_DEG])
     return (wanted @ directions.T).argmax(1).tolist()
 
 
 def sheet_tiles(
-    header: StackHeader, fit: FaceFit, model: MorphableModel, shown: Mapping[int, np.ndarray]
+    header: StackHeader, fit: FaceFit, model: MorphableModel, images: Mapping[int, np.ndarray]
 ) -> np.ndarray:
-    """Tiles of one camera [6, h, w, 3]: fully lit, the fit over it, masked, and three single lights.
+    """Draw the tiles of one camera [6, h, w, 3]: fully lit, with the fit, masked, and three single lights.
 
-    Scene-linear, exposed for display; the three lights share one exposure.
+    They are scene-linear, exposed for display; the three lights share one exposure.
     """
     side_px = fit.crop.size_px
     lit = header.source * np.float32(2 ** auto_exposure_ev(header.source))
     overlay = draw_fit(header.source, replace(fit, crop=Crop(0.0, 0.0, float(side_px), side_px)), model)
     masked = lit * (0.1 + 0.9 * header.seen[..., None])
-    single = np.stack([shown[light] for light in sheet_lights(header.directions)])
+    single = np.stack([images[light] for light in sheet_lights(header.directions)])
     single *= np.float32(2 ** auto_exposure_ev(single.reshape(-1, side_px, 3)))
     small = Crop(0.0, 0.0, float(side_px), _TILE_PX)  # crops of a subject may differ in size
     tiles = np.stack([small.apply(tile.clip(0, 1)) for tile in (lit, overlay, masked, *single)])

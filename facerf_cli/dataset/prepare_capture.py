@@ -1,7 +1,7 @@
-"""All subjects of a capture checked and prepared, for `facerf prepare-dataset`."""
+"""Check and prepare all subjects of a capture, for `facerf prepare-dataset`."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -36,6 +36,7 @@ from facerf_cli.dataset.dataset import (
     LARGEST_CROP_PX,
     DatasetFolder,
     Split,
+    SubjectRecord,
     describe_dataset,
     preparation,
 )
@@ -74,17 +75,17 @@ def prepare_capture(
     """Prepare all subjects of the capture in a folder, or only check them; return the exit code."""
     split, overwrite, output = Split.parse(content.split), batch.overwrite == "always", batch.output
     if (px := content.crop) is not None and (px % CROP_STEP_PX or not 0 < px <= LARGEST_CROP_PX):
-        raise UsageError(f"--crop {px}: give a multiple of {CROP_STEP_PX} up to {LARGEST_CROP_PX}")
+        raise UsageError(f"--crop {px}: use a multiple of {CROP_STEP_PX} up to {LARGEST_CROP_PX}")
     capture = _open_capture(folder, reading, chart)
     _check_subjects(capture, output, split)
     items = [Item(capture.folder / name, output / name, name) for name in capture.subjects]
     if checking.checks == "only" and not batch.dry_run:
-        return check_all(partial(_check, capture), items, batch, checking.strict, settings)
+        return _check_all(capture, items, batch, checking.strict, settings)
     networks = Networks(serving_files(settings.checkpoints, user="facerf"), torch_device(settings))
     model, is_builtin = load_face_model(content.face_model), content.face_model == BUILTIN
     model_sha256 = file_sha256(BUILTIN_PATH if is_builtin else Path(content.face_model))
     made_from = preparation(capture, model_sha256, content.crop, networks.sha256("parsing"))
-    how = Preparation(model, networks, DatasetFolder(output), content.crop, made_from, checking.strict)
+    how = Preparation(model, networks, DatasetFolder(folder=output), content.crop, made_from, checking.strict)
     if not overwrite:
         _judge_earlier(capture, output, made_from, batch.dry_run)
     elif not batch.dry_run:
@@ -96,21 +97,18 @@ def prepare_capture(
     return code
 
 
-def check_all(
-    work: Callable[[Item], list[Finding]],
-    items: Sequence[Item],
-    batch: BatchOptions,
-    strict: bool,
-    settings: Settings,
+def _check_all(
+    capture: Capture, items: Sequence[Item], batch: BatchOptions, strict: bool, settings: Settings
 ) -> int:
     """Check all subjects, print the table and write findings.jsonl; return 1 if a subject would be stopped.
 
     UsageError with `--shard`, because the file covers all subjects.
     """
+    work = partial(_check, capture)
     if batch.shard.of > 1:
-        raise UsageError("--shard: --checks only checks all subjects; omit it, and give --jobs or --ray")
+        raise UsageError("--shard: --checks only checks all subjects; use --jobs or --ray instead")
     results = spread(work, items, batch.workers(settings), _not_checked, "checks")
-    findings = [found for of_subject in results for found in of_subject]
+    findings = [finding for of_subject in results for finding in of_subject]
     write_findings(batch.output / FINDINGS_FILE, findings)
     show_findings(findings, strict)
     if not findings:
@@ -129,11 +127,11 @@ def _not_checked(item: Item, error: Exception) -> list[Finding]:
 
 
 def _open_capture(folder: Path, reading: ReadSettings, chart: ChartSettings) -> Capture:
-    """Read a capture's description and --colour-chart, and log the corrections; UsageError for wrong ones."""
+    """Read a capture's description and --colour-chart, and log the corrections."""
     image, corners = chart.colour_chart, chart.chart_corners
     if bool(corners) != bool(image):
         raise UsageError(
-            "--colour-chart, --chart-corners: one is missing; give the image and its chart's corners"
+            "--colour-chart, --chart-corners: one is missing; pass the image and its chart's corners"
         )
     try:
         capture = read_capture(folder, reading)
@@ -160,45 +158,44 @@ def _parse_corners(text: str) -> np.ndarray:
     except ValueError:
         corners_px = np.empty(0)
     if corners_px.shape[1:] != (4, 2) or not np.isfinite(corners_px).all():
-        raise UsageError(f"--chart-corners '{text}': give four corners in pixels, as 'x,y x,y x,y x,y'")
+        raise UsageError(f"--chart-corners '{text}': use four corners in pixels, as 'x,y x,y x,y x,y'")
     return corners_px
 
 
 def _check_subjects(capture: Capture, output: Path, split: Split) -> None:
-    """Raise for faults that concern all subjects; log what the options leave out."""
+    """Raise UsageError for faults that concern all subjects; log what the options leave out."""
     if not capture.subjects:
         raise UsageError(
             f"{capture.folder}: no subjects found at {capture.pattern}; check the pattern and the images"
         )
     if output.resolve() == capture.folder.resolve():
-        raise UsageError(f"-o {output}: is the capture itself; give another folder")
+        raise UsageError(f"-o {output}: the folder of the capture itself; use another folder")
     if marked := sum(map(len, capture.marked.values())):
-        log.info("%s: %d images that are marked as damaged (.bad) are left out", capture.folder, marked)
+        log.info("%s: left out %d images that are marked as damaged (.bad)", capture.folder, marked)
     left = len(capture.subjects) - sum(split.counts(len(capture.subjects)))
     if left:
         log.warning("--split leaves %d of %d subjects out of every split", left, len(capture.subjects))
 
 
 def _judge_earlier(capture: Capture, output: Path, made_from: Recipe, dry_run: bool) -> None:
-    """Raise UsageError where finished subjects were prepared with other options than this run has.
+    """Raise UsageError if finished subjects were prepared with other options.
 
-    Removes the records of subjects whose missing frames exist by now, so that they are prepared again.
+    Removes the records of subjects whose missing frames exist now, so that they are prepared again.
     """
-    dataset = DatasetFolder(output)
+    dataset = DatasetFolder(folder=output)
     earlier = prepared_subjects(capture, dataset)
     for subject, record in earlier.items():
-        before, said = record.get("prepared"), f"{output}: {subject} was prepared otherwise"
-        advice = "give --overwrite always to prepare all subjects again, or another folder with -o"
-        require_same(before if isinstance(before, dict) else {}, made_from, said, advice)
+        advice = "pass --overwrite always to prepare all subjects again, or another folder with -o"
+        require_same(record.prepared, made_from, f"{output}: {subject} was prepared otherwise", advice)
     for subject, record in () if dry_run else earlier.items():
-        if has_new_frames(capture, subject, record.get("missing", ())):
-            log.info("%s: frames that were missing exist now; it is prepared again", subject)
+        if has_new_frames(capture, subject, record.missing):
+            log.info("%s: missing frames exist now; preparing the subject again", subject)
             dataset.record_path(subject).unlink()
 
 
 @dataclass(frozen=True)
 class Prepare(Job):
-    """Prepares one subject; settings only."""
+    """Job that prepares one subject."""
 
     verb = "prepare-dataset"
 
@@ -207,7 +204,7 @@ class Prepare(Job):
     with_checks: bool
 
     def outputs_of(self, item: Item) -> Sequence[Path]:
-        """Files of a subject."""
+        """Return the files of a subject."""
         return subject_outputs(self.capture, item.name, self.how.dataset)
 
     def __call__(self, item: Item) -> Outcome:
@@ -215,12 +212,11 @@ class Prepare(Job):
         with one_thread():
             chosen = self._choose(item.name)
             record = prepare_subject(self.capture, item.name, chosen, self.how)
-        if record["quality"] == "poor":
-            log.warning("%s: the fit is poor; look at sheets/%s.jpg", item.input_path, item.name)
-        worst = max(entry["crop_off_iod"] for entry in record["cameras"].values())
-        facts = {name: record[name] for name in ("error_iod", "quality", "faces_found")}
-        facts |= {"cameras": len(record["cameras"]), "worst_crop_off_iod": worst}
-        facts |= {"lights": len(chosen.lights)}
+        if record.quality == "poor":
+            log.warning("%s: the fit is poor; check sheets/%s.jpg", item.input_path, item.name)
+        facts = record.model_dump(include={"error_iod", "quality", "faces_found"})
+        facts |= {"cameras": len(record.cameras), "lights": len(chosen.lights)}
+        facts |= {"worst_crop_off_iod": max(camera.crop_off_iod for camera in record.cameras.values())}
         return Outcome(self.outputs_of(item), facts)
 
     def _choose(self, subject: str) -> Selection:
@@ -236,23 +232,28 @@ def _write_dataset(
     capture: Capture, how: Preparation, split: Split, seed: int, face_model_sha256: str
 ) -> None:
     """Write findings.jsonl, the index page and dataset.json of the subjects prepared with these options."""
-    folder, found = how.dataset.folder, prepared_subjects(capture, how.dataset).items()
-    records = {subject: record for subject, record in found if record.get("prepared") == how.made_from}
+    folder = how.dataset.folder
+    records: dict[str, SubjectRecord] = {
+        subject: record
+        for subject, record in prepared_subjects(capture, how.dataset).items()
+        if record.prepared == how.made_from
+    }
     findings = collect_findings(folder, capture.subjects)
-    show_findings([found for of_subject in findings.values() for found in of_subject], how.strict)
+    show_findings([finding for of_subject in findings.values() for finding in of_subject], how.strict)
     if not records:
         return
     for older in folder.glob("colour_chart*.png"):
         older.unlink()
     write_chart_overlays(capture, folder)
-    dataset = describe_dataset(capture, records, split, seed, how.model, face_model_sha256)
+    dataset = describe_dataset(folder, capture, records, split, seed, how.model, face_model_sha256)
     with atomic_path(folder / "index.html") as temporary:
         text = index_page(dataset, records, findings)
         temporary.write_text(text, encoding="utf-8", errors="replace")  # folder names may be any bytes
-    write_document(folder / DATASET_FILE, dataset)
+    write_document(folder / DATASET_FILE, dataset.content())
     print(folder / DATASET_FILE)
-    split_of = {subject: name for name, members in dataset["splits"].items() for subject in members}
     pairs = json_rows(folder / RELIT / PAIRS_NAME)
-    if moved := {row.get("subject") for row in pairs if split_of.get(row.get("subject")) != row.get("split")}:
-        words = "%s: the pairs of %d subjects are of another split; %s"
+    if moved := {
+        row.get("subject") for row in pairs if dataset.split_of(str(row.get("subject"))) != row.get("split")
+    }:
+        words = "%s: the pairs of %d subjects belong to another split; %s"
         log.warning(words, folder / RELIT, len(moved), GIVE_BEFORE)

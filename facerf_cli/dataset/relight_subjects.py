@@ -1,4 +1,4 @@
-"""Pairs and sources of all subjects of a dataset, for `facerf relight-dataset`."""
+"""Write the pairs and sources of all subjects of a dataset, for `facerf relight-dataset`."""
 
 import logging
 import os
@@ -31,7 +31,7 @@ from facerf_cli.synth.sky.skies import parse_envmaps
 T = TypeVar("T")
 R = TypeVar("R")
 _DRAWN = "procedural:"
-_TEST_MAPS_OF = 10  # one in so many maps is for the split test alone
+_TEST_MAPS_OF = 10  # one in ten maps is only for the split test
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -49,7 +49,7 @@ def relight_subjects(folder: Path, wanted: PairSettings, batch: BatchOptions, se
     else:
         write_pairs(dataset, pairs, overwrite, partial(_spread_maps, batch, settings))
         if test_maps != maps:
-            log.info("maps: %d, and %d others for the split test alone", len(maps), len(test_maps))
+            log.info("maps: %d, and %d others only for the split test", len(maps), len(test_maps))
     if wanted.lazy:
         print(pairs_path(dataset))
         return 0
@@ -62,9 +62,9 @@ def relight_subjects(folder: Path, wanted: PairSettings, batch: BatchOptions, se
 def _maps_of_splits(
     dataset: Dataset, wanted: PairSettings, output: Path, seed: int
 ) -> tuple[list[str], list[str]]:
-    """Names of the maps of training and validation, and those of the test; UsageError where they share one.
+    """Return the names of the maps for training and validation, and for the test; they may not share any.
 
-    Drawn maps of the test follow those of --envmaps in their sequence.
+    Procedural maps of the test follow the ones of --envmaps in their sequence.
     """
     maps = _envmap_names("--envmaps", wanted.envmaps, output, seed)
     if wanted.envmaps_test is not None:
@@ -75,27 +75,28 @@ def _maps_of_splits(
         ):
             raise UsageError(
                 f"--envmaps-test {wanted.envmaps_test}: has {len(shared)} maps of --envmaps, such as "
-                f"{Path(shared[0]).name}; give the test maps of its own"
+                f"{Path(shared[0]).name}; use other maps for the test"
             )
         return maps, test_maps
     if not dataset.splits["test"] or not (dataset.splits["train"] or dataset.splits["validation"]):
         return maps, maps
     if len(maps) < 2:
         raise UsageError(
-            f"--envmaps {wanted.envmaps}: is one map, and the split test needs others; give it some by "
-            "--envmaps-test"
+            f"--envmaps {wanted.envmaps}: only one map, but the split test needs others; use --envmaps-test"
         )
     test_maps = maps[::_TEST_MAPS_OF]
     return [name for index, name in enumerate(maps) if index % _TEST_MAPS_OF], test_maps
 
 
 def _envmap_names(option: str, envmaps: str, output: Path, seed: int, first: int = 0) -> list[str]:
-    """Names of the maps of an option; drawn ones begin at number `first` of their sequence."""
+    """Return the names of an option's maps; procedural ones begin at number `first` of their sequence."""
     if envmaps.startswith(_DRAWN):
         maps = parse_envmaps(envmaps, seed)
         return envmap_names(replace(maps, maps=first + len(maps)))[first:]
     if not Path(envmaps).exists():
-        raise UsageError(f"{option} {envmaps}: no such folder; give one of lat-long maps, or procedural:N")
+        raise UsageError(
+            f"{option} {envmaps}: no such folder; use a folder of lat-long maps, or procedural:N"
+        )
     return envmap_names([item.input_path for item in collect_items([envmaps], output, MAP_SUFFIXES)])
 
 
@@ -108,11 +109,11 @@ class _Relight(Job):
     overwrite: bool
 
     def outputs_of(self, item: Item) -> list[Path]:
-        """Paths of the sources of the subject's pairs."""
+        """Return the paths of the sources of the subject's pairs."""
         return [image_path(self.dataset, item.name, index) for index in range(self.per_subject)]
 
     def __call__(self, item: Item) -> Outcome:
-        """Write the sources that are missing."""
+        """Write the missing sources."""
         pairs, weights = load_pairs(self.dataset)[item.name]
         made = relight_subject(self.dataset, pairs, weights, memory.limit_bytes(), self.overwrite)
         return Outcome(self.outputs_of(item), {"pictures": len(pairs), "made": made})
@@ -123,7 +124,7 @@ def _spread_maps(
 ) -> Iterator[R]:
     if batch.shard.of > 1:  # shards would write the same pairs at the same time
         raise UsageError(
-            "--shard: the pairs are not drawn yet; run once with --lazy and without --shard first"
+            "--shard: the pairs are not drawn yet; first run once with --lazy and without --shard"
         )
     return spread(work, maps, batch.workers(settings), _map_died, "maps")
 

@@ -1,4 +1,4 @@
-"""Options of a prepared dataset and of its pairs; light to import."""
+"""Options of `prepare-dataset` and `relight-dataset`; light to import."""
 
 from dataclasses import dataclass
 
@@ -12,10 +12,10 @@ class DatasetSettings:
     """Settings of the contents of a dataset.
 
     Attributes:
-        split: Split the subjects into training, validation and test: counts (300/10/40) or shares, drawn by
-            --seed.
-        crop: Write crops of this side, a multiple of 8.
-        face_model: Fit this morphable model: builtin, or a .npz of `face-model import`.
+        split: Sizes of training, validation and test: counts of subjects (300/10/40) or fractions; subjects
+            are assigned at random by --seed.
+        crop: Side of the crops, a multiple of 8.
+        face_model: Morphable model to fit: builtin, or a .npz of `face-model import`.
     """
 
     split: str = option("0.8/0.1/0.1", metavar="T/V/T", panel=_DATASET)
@@ -30,11 +30,11 @@ class PairSettings:
     """Which pairs to draw from a dataset.
 
     Attributes:
-        envmaps: Relight with these lat-long maps (.exr, .hdr) of any size: a folder (walked recursively), a
+        envmaps: Lat-long maps (.exr, .hdr) of any size to relight with: a folder (walked recursively), a
             file, or N maps drawn from --seed.
-        envmaps_test: Relight the people of the split test with these maps, which no other split has.
-        per_subject: Make so many images of each subject.
-        lazy: Write the recipes alone; training relights when it needs them.
+        envmaps_test: Maps for the people of the split test; no other split uses them.
+        per_subject: Number of images of each subject.
+        lazy: Write only the recipes; training does not need the images.
     """
 
     envmaps: str = option(..., metavar="DIR|FILE|procedural:N", shown_default=False)

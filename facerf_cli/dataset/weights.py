@@ -1,16 +1,16 @@
 """Weights of a dataset's lights under envmaps, and OLAT stacks summed with them (paper, 'Dataset').
 
 **The frame of an envmap.** A stack's lights are in its crop's camera space, d_crop = R_fit R_world_to_head
-d_world, so their directions differ between cameras although the lights stay where they are. An envmap must
-stay where it is, too: its weights are computed once, for the lights' world directions, and serve every camera
-and subject. In a camera's space that is the envmap turned by R_fit R_world_to_head. `rotate_deg` turns the
-envmap about the world's vertical. Captures choose their own axes, so `world_to_map` derives them from the
-heads: the world axis nearest to their up becomes the envmap's y, the one nearest to their gaze its z.
+d_world, so their directions differ between cameras although the lights do not move. An envmap must not move
+either: its weights are computed once, for the lights' world directions, and serve all cameras and subjects.
+In a camera's space, this is the envmap rotated by R_fit R_world_to_head. `rotate_deg` rotates the envmap
+about the world's vertical. Captures choose their own axes, so `world_to_map` derives them from the heads: the
+world axis nearest to their up becomes the envmap's y, the one nearest to their gaze its z.
 
-**Tiles.** A channel at a time, weights [M, L] are multiplied with a stack [L, P] in tiles of constant shape:
-`TILE_IMAGES` images (the last tile is padded with zeros) by a number of whole rows that depends on the
-image's size and the number of lights alone. So an image's bits depend neither on how many others are made
-with it nor on the memory limit.
+**Tiles.** For each channel, weights [M, L] are multiplied with a stack [L, P] in tiles of constant shape:
+`TILE_IMAGES` images (the last tile is padded with zeros) by a number of complete rows that depends only on
+the image's size and the number of lights. Therefore an image's bits do not depend on the number of images
+made together or on the memory limit.
 """
 
 import math
@@ -40,7 +40,7 @@ _PROCEDURAL = re.compile(r"procedural:(\d{1,9}):(\d+):([1-9]\d{0,3})")  # index,
 
 @dataclass(frozen=True, eq=False)
 class EnvmapTask:
-    """An envmap, its rotations, and the lights whose weights are wanted."""
+    """Envmap, rotations, and lights to compute weights for."""
 
     name: str
     directions: Tensor  # [L, 3] of the whole rig in the envmap's axes, from `map_directions`
@@ -62,16 +62,16 @@ Spread = Callable[[Callable[[EnvmapTask], EnvmapResult], Sequence[EnvmapTask]], 
 
 
 def envmap_names(maps: Sequence[Path] | ProceduralMaps) -> list[str]:
-    """Names of envmaps, as pairs hold them: absolute paths, or procedural:INDEX:SEED:WIDTH."""
+    """Return the names of envmaps in pairs: absolute paths, or procedural:INDEX:SEED:WIDTH."""
     if len(maps) > _MOST_MAPS:
-        raise UsageError(f"--envmaps: {len(maps)} maps; give at most {_MOST_MAPS}")
+        raise UsageError(f"--envmaps: {len(maps)} maps; use at most {_MOST_MAPS}")
     if isinstance(maps, ProceduralMaps):
         return [f"procedural:{index}:{maps.seed}:{maps.width_px}" for index in range(len(maps))]
     return [str(path.absolute()) for path in maps]
 
 
 def read_envmap(name: str) -> Tensor:
-    """Read the lat-long map [H, W, 3] of a pair, scene-linear; raise InputError where it is invalid."""
+    """Read the lat-long map [H, W, 3] of a pair, scene-linear; raise InputError if it is invalid."""
     if drawn := _PROCEDURAL.fullmatch(name):
         return torch.from_numpy(draw_sky(int(drawn[1]), int(drawn[2]), int(drawn[3]))[0])
     return read_map_file(name)
@@ -93,7 +93,7 @@ def compute_weights(task: EnvmapTask) -> EnvmapResult:
 
 
 def _weights(envmap: Tensor, task: EnvmapTask) -> Tensor:
-    """Weights [R, L, 3] without exposure; the cells are those of the lights that the row has."""
+    """Compute weights [R, L, 3] without exposure, over the cells of each row's lights."""
     everything = tuple(range(len(task.directions)))
     lights = task.lights or (everything,) * len(task.rotations_deg)
     weights = torch.zeros(len(lights), len(everything), 3)
@@ -106,14 +106,14 @@ def _weights(envmap: Tensor, task: EnvmapTask) -> Tensor:
 
 
 def map_directions(dataset: Dataset) -> Tensor:
-    """Directions of a dataset's lights [L, 3] in the envmaps' axes, float64."""
+    """Return the directions [L, 3] of a dataset's lights in the envmaps' axes, float64."""
     return torch.from_numpy(dataset.directions_world @ world_to_map(dataset).T)
 
 
 def world_to_map(dataset: Dataset) -> np.ndarray:
-    """Permutation of the world's axes with signs [3, 3] after which y is up and z is where faces look.
+    """Find the signed permutation [3, 3] of the world's axes that makes y up and z the gaze of faces.
 
-    Derived from the first heads: a stack's lights and rotation tell how its head stands in the world.
+    It is derived from the first heads: a stack's lights and rotation give its head's pose in the world.
     """
     heads = [
         _world_to_head(dataset, subject, cameras[0])
@@ -130,7 +130,7 @@ def world_to_map(dataset: Dataset) -> np.ndarray:
 
 
 def _world_to_head(dataset: Dataset, subject: str, camera: str) -> np.ndarray:
-    """Rotation [3, 3] from the lights' world directions to the stack's lights in the head's frame."""
+    """Fit the rotation [3, 3] from the lights' world directions to the stack's in the head's frame."""
     path = dataset.stack_path(subject, camera)
     header = read_olat_header(path)
     in_world = dataset.directions_world[list(dataset.lights_of(subject))]
@@ -145,7 +145,7 @@ def _world_to_head(dataset: Dataset, subject: str, camera: str) -> np.ndarray:
 
 TILE_IMAGES = 128
 DEFAULT_MEMORY_BYTES = 2 << 30
-# A tile has at most so many pixels, and so many lights times pixels, held three times over as float32.
+# Limits of a tile: pixels, and lights times pixels, with three float32 copies of each.
 _TILE_PX = 1 << 13
 _TILE_VALUES = 1 << 22
 
@@ -153,15 +153,15 @@ _TILE_VALUES = 1 << 22
 def relit_images(path: Path, weights: Tensor, memory_bytes: int = DEFAULT_MEMORY_BYTES) -> Iterator[Tensor]:
     """Yield the images [3, H, W] float16 of a stack under weights [M, L, 3], in order, on one thread.
 
-    Half of the memory holds the stack, or a strip of its rows, and a quarter the current batch of images. A
-    stack that fits is read once, otherwise once a batch.
+    The stack, or a strip of its rows, takes half of the memory, the current batch of images a quarter. A
+    stack that fits is read once, a larger one once per batch.
     """
     header = read_olat_header(path)
     (height, width), lights = header.seen.shape, len(header.directions)
     if weights.shape[1] != lights:
         raise InputError(f"{path}: {lights} lights, the dataset has {weights.shape[1]}; {PREPARE_AGAIN}")
     rows = memory_bytes // 2 // (6 * lights * width)
-    if rows < height:  # as many whole tiles and compressed blocks as fit
+    if rows < height:  # complete tiles and compressed blocks
         rows = max(_power_of_two(rows), _tile_rows(lights, width))
     whole = read_olats(path) if rows >= height else None
     batch = max(1, memory_bytes // (4 * 6 * height * width))
@@ -175,7 +175,7 @@ def relit_images(path: Path, weights: Tensor, memory_bytes: int = DEFAULT_MEMORY
 
 
 def multiply(olats: Tensor, weights: Tensor, images: Tensor) -> None:
-    """Fill images [M, 3, h, W] with OLATs [L, 3, h, W] under weights [M, L, 3]; float16 but the weights."""
+    """Fill images [M, 3, h, W] float16 with OLATs [L, 3, h, W] float16 under weights [M, L, 3]."""
     lights, _, height, width = olats.shape
     rows = _tile_rows(lights, width)
     blocks = torch.split(weights.permute(2, 0, 1), TILE_IMAGES, dim=1)  # [3, m, L]
@@ -190,10 +190,10 @@ def multiply(olats: Tensor, weights: Tensor, images: Tensor) -> None:
 
 
 def _tile_rows(lights: int, width: int) -> int:
-    """Rows of a tile, a power of two."""
+    """Return the rows of a tile, a power of two."""
     return _power_of_two(min(_TILE_PX, _TILE_VALUES // lights) // width)
 
 
 def _power_of_two(number: int) -> int:
-    """Largest power of two up to a number, at least 1."""
+    """Return the largest power of two up to a number, at least 1."""
     return 1 << max(0, number.bit_length() - 1)

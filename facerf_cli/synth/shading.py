@@ -66,7 +66,7 @@ def scatter(irradiance: Tensor, sigma_texels: Tensor) -> Tensor:
     """Blur irradiance [B, 3, T, T] by one Gaussian per channel, of sigma [B, 3] texels."""
     faces, channels, side, _ = irradiance.shape
     reach = _SCATTER_REACH
-    offset = torch.arange(-reach, reach + 1)
+    offset = torch.arange(-reach, reach + 1, device=irradiance.device)
     kernel = torch.exp(-0.5 * (offset / sigma_texels.reshape(-1, 1)) ** 2)
     kernel = kernel / kernel.sum(-1, keepdim=True)
     flat = F.pad(irradiance.reshape(1, -1, side, side), (reach,) * 4, mode="replicate")

@@ -1,26 +1,28 @@
 """Stage `diffuse-sh`: the network of the diffuse baseline (`network/diffuse_sh.py`), on textures.
 
 The albedo is trained on targets under known lights, the light on the source, with the albedo held constant.
-If the source also trained the albedo, the source itself under a constant light would be a perfect solution,
-in which training stays. Spherical harmonics of order 2 cannot represent a single light, and the baseline is
-not used with one: a target is a sum of several. All are at the network's exposure.
+If the source also trained the albedo, the source itself under a constant light would be a degenerate optimum
+that training does not leave. Spherical harmonics of order 2 cannot represent a single light, and the baseline
+is not used with one: a target is a sum of several. All are at the network's exposure.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from facerf_cli.dataset.faces import DatasetFaces, SampleCrops
 from facerf_cli.light.sh import rig_coefficients
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.network.diffuse_sh import ORDER, DiffuseEstimate, DiffuseNetwork, shading
 from facerf_cli.network.inputs import Batch, to_root
 from facerf_cli.synth.bank.texture_samples import Sample, SampleSource
+from facerf_cli.training.build import Run
 from facerf_cli.training.losses import clipped_si_mse, root_loss
-from facerf_cli.training.objective import Validation, metrics_by_pose
+from facerf_cli.training.objective import Objective, Validation, metrics_by_pose
 from facerf_cli.training.sheets import tiled
-from facerf_cli.training.texture import HeadsObjective, HeadsSettings
+from facerf_cli.training.texture import HeadsSettings, SamplesObjective
 
 _SHEET_FACES = 5
 _TOTAL = 1.5  # of a sum's weights: a face lit from the front then has about the albedo's radiance
@@ -37,26 +39,22 @@ class SumSettings(HeadsSettings):
 
 @dataclass(frozen=True)
 class DiffuseBatch(Batch):
-    """B faces with M targets each: fields as in `Sample`, and the targets' lights."""
+    """Samples of B faces, and M sums of their L lights: weights [B, M, L, 3], coefficients [B, M, 9, 3]."""
 
-    source: Tensor  # [B, 3, T, T]
-    visible: Tensor  # [B, 1, T, T]
-    normals_source: Tensor  # [B, 3, T, T]
-    normals_target: Tensor  # [B, 3, T, T]
-    targets: Tensor  # [B, M, 3, T, T]
-    coefficients: Tensor  # [B, M, 9, 3] in camera space
-    weight: Tensor  # [B, 1, T, T]
+    sample: Sample | SampleCrops
+    weights: Tensor
+    coefficients: Tensor  # in camera space
     heads: Tensor  # [B] indices
 
 
-class DiffuseObjective(HeadsObjective):
+class DiffuseObjective(SamplesObjective):
     """`root_loss` of the source under its estimated light, and of sums of known lights."""
 
     chooses_by = "si_mse"
 
     def __init__(
         self,
-        source: SampleSource,
+        source: SampleSource | DatasetFaces,
         network: DiffuseNetwork | None = None,
         settings: SumSettings = SumSettings(),
     ) -> None:
@@ -64,44 +62,53 @@ class DiffuseObjective(HeadsObjective):
         network.set_mean_face(source.mean_face()[0])
         super().__init__("diffuse_sh", network, source, settings)
 
-    def draw_head(self, head: Tensor, generator: torch.Generator) -> DiffuseBatch:
-        """Draw a face and random sums of its single lights."""
-        sample = self.source.draw(head, self.settings.lights, generator)
+    def batch_of(
+        self, sample: Sample | SampleCrops, head: Tensor, generator: torch.Generator
+    ) -> DiffuseBatch:
+        """Draw random sums of the single lights of a sample."""
         weights = draw_sums(self.settings.sums, sample.lights.shape[1], generator)
-        return sum_lights(sample, weights, head)
+        coefficients = [rig_coefficients(RigLight(sample.lights[0], w), ORDER) for w in weights]
+        return DiffuseBatch(sample, weights[None], torch.stack(coefficients)[None], head)
 
     def forward(self, batch: DiffuseBatch) -> dict[str, Tensor]:
-        """Compute `source`, for the light alone, and `targets`, for the albedo; means over faces."""
+        """Compute `source`, which trains only the light, and `targets`, which train the albedo.
+
+        Both are means over faces.
+        """
+        sample = sum_lights(self.textures(batch.sample), batch.weights)
         with self.mixed_precision():
-            estimate = self.network(batch.source, batch.normals_source, batch.visible)
-        source = (batch.source / estimate.exposure)[:, None]
-        targets = batch.targets / estimate.exposure[:, None]
-        own, _ = predicted_images(estimate._replace(albedo=estimate.albedo.detach()), batch)
-        _, relit = predicted_images(estimate, batch)
+            estimate = self.network(sample.source, sample.normals_source, sample.visible)
+        source = (sample.source / estimate.exposure)[:, None]
+        targets = sample.target / estimate.exposure[:, None]
+        lit_by = batch.coefficients
+        own, _ = predicted_images(estimate._replace(albedo=estimate.albedo.detach()), sample, lit_by)
+        _, relit = predicted_images(estimate, sample, lit_by)
         return {
-            "source": root_loss(to_root(own), source, batch.visible),
-            "targets": root_loss(to_root(relit), targets, batch.weight),
+            "source": root_loss(to_root(own), source, sample.visible),
+            "targets": root_loss(to_root(relit), targets, sample.weight),
         }
 
     @torch.no_grad()
     def validate(self) -> Validation:
         """Measure the mean Si-MSE of held-out heads, clipped at white: of targets, by pose, and of sources.
 
-        The sheet has two rows a face: source and targets; predicted source and targets, albedo and shading.
+        The sheet has two rows per face: source and targets; predicted source and targets, albedo and shading.
         """
-        errors: list[tuple[Tensor, Tensor]] = []
+        errors: list[Tensor] = []
         same_pose: list[bool] = []
         rows: list[np.ndarray] = []
-        for batch in self.held_out_samples():
-            there = batch.to(self.device)
-            estimate = self.network(there.source, there.normals_source, there.visible)
-            own, relit = (image.cpu() for image in predicted_images(estimate, there))
-            of_source = clipped_si_mse(own, batch.source[:, None], batch.visible).mean()
-            errors.append((clipped_si_mse(relit, batch.targets, batch.weight).mean(), of_source))
-            turned = (batch.normals_source - batch.normals_target).abs().max()
+        for held_out in self.held_out_samples():
+            batch = held_out.to(self.device)
+            sample = sum_lights(self.textures(batch.sample), batch.weights)
+            estimate = self.network(sample.source, sample.normals_source, sample.visible)
+            own, relit = predicted_images(estimate, sample, batch.coefficients)
+            of_source = clipped_si_mse(own, sample.source[:, None], sample.visible).mean()
+            of_target = clipped_si_mse(relit, sample.target, sample.weight).mean()
+            errors.append(torch.stack([of_target, of_source]).cpu())
+            turned = (sample.normals_source - sample.normals_target).abs().max()
             same_pose.append(bool(turned < 1e-3))
-            rows += [_sheet_rows(batch, estimate, own, relit)] if len(rows) < _SHEET_FACES else []
-        of_targets, of_sources = torch.tensor(errors).T
+            rows += [_sheet_rows(sample, estimate, own, relit)] if len(rows) < _SHEET_FACES else []
+        of_targets, of_sources = torch.stack(errors).T
         metrics = metrics_by_pose(of_targets, torch.tensor(same_pose))
         return Validation({**metrics, "si_mse_source": float(of_sources.mean())}, np.concatenate(rows))
 
@@ -114,35 +121,36 @@ def draw_sums(sums: int, lights: int, generator: torch.Generator) -> Tensor:
     return _TOTAL * weights / weights.mean(2, keepdim=True).sum(1, keepdim=True)
 
 
-def sum_lights(sample: Sample, weights: Tensor, heads: Tensor) -> DiffuseBatch:
-    """Sum the lights of a sample of one face with weights [M, L, 3]."""
-    coefficients = [rig_coefficients(RigLight(sample.lights[0], w), ORDER) for w in weights]
-    return DiffuseBatch(
-        source=sample.source,
-        visible=sample.visible,
-        normals_source=sample.normals_source,
-        normals_target=sample.normals_target,
-        targets=torch.einsum("mlc,lcij->mcij", weights, sample.target[0])[None],
-        coefficients=torch.stack(coefficients)[None],
-        weight=sample.weight,
-        heads=heads,
-    )
+def sum_lights(sample: Sample, weights: Tensor) -> Sample:
+    """Replace the targets of a sample by sums of its lights with weights [B, M, L, 3]."""
+    return replace(sample, target=torch.einsum("bmlc,blcij->bmcij", weights, sample.target))
 
 
-def predicted_images(estimate: DiffuseEstimate, batch: DiffuseBatch) -> tuple[Tensor, Tensor]:
-    """Predicted sources [B, 1, 3, T, T] and targets [B, M, 3, T, T], at the network's exposure."""
+def predicted_images(
+    estimate: DiffuseEstimate, sample: Sample, coefficients: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Predict sources [B, 1, 3, T, T] and targets [B, M, 3, T, T], at the network's exposure.
+
+    coefficients: [B, M, 9, 3], of the targets' lights.
+    """
     albedo = estimate.albedo[:, None]
-    own = shading(batch.normals_source, estimate.coefficients[:, None])
-    return albedo * own, albedo * shading(batch.normals_target, batch.coefficients)
+    own = shading(sample.normals_source, estimate.coefficients[:, None])
+    return albedo * own, albedo * shading(sample.normals_target, coefficients)
 
 
-def _sheet_rows(batch: DiffuseBatch, estimate: DiffuseEstimate, own: Tensor, relit: Tensor) -> np.ndarray:
-    """Two rows of textures [2T, (M + 3) T, 3] of one face."""
-    exposure = estimate.exposure[0].cpu()
-    seen, mask = batch.visible[0], (batch.weight[0] > 0).float()
-    albedo = estimate.albedo[0].cpu()
-    lit = shading(batch.normals_source, estimate.coefficients[:, None].cpu())[0, 0]
-    truth = [batch.source[0] / exposure, *(batch.targets[0] / exposure * mask)]
+def _sheet_rows(sample: Sample, estimate: DiffuseEstimate, own: Tensor, relit: Tensor) -> np.ndarray:
+    """Draw two rows of textures [2T, (M + 3) T, 3] of one face."""
+    seen, mask = sample.visible[0], (sample.weight[0] > 0).float()
+    albedo, exposure = estimate.albedo[0], estimate.exposure[0]
+    lit = shading(sample.normals_source, estimate.coefficients[:, None])[0, 0]
+    truth = [sample.source[0] / exposure, *(sample.target[0] / exposure * mask)]
     guess = [own[0, 0] * seen, *(relit[0] * mask)]
     blank = torch.zeros_like(albedo)
     return tiled([[*truth, blank, blank], [*guess, albedo, lit / 4]])
+
+
+def build(run: Run) -> Objective:
+    """Make the objective of the stage."""
+    settings = SumSettings(held_out_heads=run.sizes.held_out_heads)
+    objective: Objective = run.objective(DiffuseObjective)(run.faces(), run.network("diffuse_sh"), settings)
+    return objective

@@ -1,8 +1,8 @@
-"""Stage `geometry`: the Geometry Network alone, on rendered faces with known landmarks.
+"""Stage `geometry`: train only the Geometry Network, on rendered faces with known landmarks.
 
-The estimated head's landmarks are compared with the true ones in the image, as in the paper's landmark loss.
-Contour landmarks do not slide, for here hidden ones are known, too. The targets of pose and coefficients are
-those of the fit to the same landmarks.
+The estimated head's landmarks are compared with the true ones in the image, like in the paper's landmark
+loss. Contour landmarks do not slide, because here hidden ones are also known. The targets of pose and
+coefficients are from the fit to the same landmarks.
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,8 @@ from facerf_cli.face.topology import CONTOUR, OUTER_EYE_CORNERS
 from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometryNetworkSettings
 from facerf_cli.network.inputs import concatenate
 from facerf_cli.raster.camera import crop_camera, project
-from facerf_cli.synth.bank.face_crops import FaceCrops, RenderedFaces
+from facerf_cli.synth.bank.face_crops import FaceCrops, RenderedFaces, add_head_images
+from facerf_cli.training.build import Run
 from facerf_cli.training.objective import Objective, Validation
 from facerf_cli.training.sheets import FOUND_COLOUR, TRUE_COLOUR, in_rows, mark, tiled
 
@@ -98,20 +99,20 @@ class GeometryObjective(Objective):
 
     def estimate(self, crops: Tensor) -> GeometryEstimate:
         """Run the network on crops [B, 3, S, S]."""
-        found: GeometryEstimate = self.network(crops)
-        return found
+        estimate: GeometryEstimate = self.network(crops)
+        return estimate
 
     def landmarks_px(self, estimate: GeometryEstimate, side: int) -> Tensor:
-        """Landmarks [B, 68, 2] of an estimate in a crop of a side, differentiable."""
+        """Project the landmarks [B, 68, 2] of an estimate into a crop of a side, differentiably."""
         offset = torch.einsum("bk,knc->bnc", estimate.alpha, self.identity_m)
         offset = offset + torch.einsum("bk,knc->bnc", estimate.beta, self.expression_m)
         in_camera = (self.mean_m + offset) @ estimate.rotation.mT + estimate.translation_m[:, None]
         return project(in_camera, crop_camera(side))
 
     def distances_iod(self, estimate: GeometryEstimate, batch: FaceCrops) -> Tensor:
-        """Distances [B, 68] to the true landmarks over the mean face's inter-ocular distance at their depth.
+        """Return distances [B, 68] to the true landmarks over the mean face's inter-ocular distance there.
 
-        The eyes of a turned head lie close together in the image; their distance would give it more weight.
+        The eyes of a turned head are close together in the image; their distance would give it more weight.
         """
         side, (left, right) = batch.crops.shape[-1], OUTER_EYE_CORNERS
         predicted = self.landmarks_px(estimate, side)
@@ -141,7 +142,7 @@ class GeometryObjective(Objective):
         return Validation(metrics, self._sheet(batch, estimate))
 
     def _sheet(self, batch: FaceCrops, estimate: GeometryEstimate) -> np.ndarray:
-        """Held-out crops with the true landmarks in green and the estimated ones in red."""
+        """Draw held-out crops with the true landmarks in green and the estimated ones in red."""
         side, count, size = batch.crops.shape[-1], _SHEET_ROWS * _SHEET_COLUMNS, _SHEET_PX
         images = nn.functional.interpolate(batch.crops[:count].cpu(), (size, size), mode="nearest")
         images = images / images.mean((1, 2, 3), keepdim=True).clamp_min(1e-6) * 0.18
@@ -150,3 +151,15 @@ class GeometryObjective(Objective):
             mark(image, true_px * size / side, TRUE_COLOUR)
             mark(image, found_px * size / side, FOUND_COLOUR)
         return tiled(in_rows([*images], _SHEET_COLUMNS))
+
+
+def build(run: Run) -> Objective:
+    """Make the objective of the stage; bake heads and render their images where they are missing."""
+    options, sizes, images = run.options, run.sizes, run.bank / "pictures"
+    provenance = run.bake_heads()
+    add_head_images(run.bank / "heads", images, sizes.images, options.jobs, options.settings.seed)
+    faces = RenderedFaces(images, provenance)
+    settings = GeometryObjectiveSettings(held_out_heads=sizes.held_out_heads)
+    network = run.geometry(faces.mean_translation_m())
+    objective: Objective = run.objective(GeometryObjective)(faces, network, settings)
+    return objective

@@ -2,24 +2,35 @@
 
 The Geometry Network estimates a head for the source and one for the target crop. The source is unwrapped
 with its head, relit by the Reflectance Network, rendered with the target's head and compared with the target
-(paper, 'Loss Functions'). A share of the batches are photos, for the geometry terms alone ('Training').
+(paper, 'Loss Functions'). Some of the batches are photos, which train only the geometry ('Training').
 """
 
-import math
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from facerf_cli.dataset.crops import CropPairs, PhotoCrops, Photos, open_pairs, spread_pairs
+from facerf_cli.batch.inputs import PHOTO_SUFFIXES, collect_items
+from facerf_cli.dataset.crops import (
+    CropPairs,
+    mean_translation_m,
+    open_pairs,
+    require_crops,
+    spread_pairs,
+    unwrap_crops,
+)
 from facerf_cli.dataset.dataset import Dataset, provenance_of
+from facerf_cli.dataset.faces import mean_face_of
 from facerf_cli.dataset.pairs import Pair
-from facerf_cli.dataset.textures import DatasetTextures
+from facerf_cli.dataset.photos import PhotoCrops, Photos, open_photos
+from facerf_cli.errors import UsageError
 from facerf_cli.face.fit import fit_batch
-from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import (
     CONTOUR,
     INNER_MOUTH_CORNERS,
@@ -33,20 +44,20 @@ from facerf_cli.face.topology import (
 from facerf_cli.network.features import FEATURE_LAYERS, TrainedFeatures, VggFeatures, layer_powers
 from facerf_cli.network.geometry import GeometryEstimate
 from facerf_cli.network.inputs import Batch, SourceColours, concatenate, resize, without_cast
-from facerf_cli.network.vgg import VGG16_LICENCE
+from facerf_cli.network.vgg import VGG16_LICENCE, load_vgg
 from facerf_cli.raster.camera import Camera, crop_camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
-from facerf_cli.raster.texture import UnwrapSettings, inpaint, normal_map, sample_texture, unwrap
+from facerf_cli.raster.texture import inpaint, normal_map, sample_texture
+from facerf_cli.training.build import Run
 from facerf_cli.training.losses import (
     Features,
     MaskedPair,
     PaperWeights,
-    appearance_loss,
     channels_apart,
     clipped_si_mse,
     colour_shares,
     landmark_loss,
-    light_loss,
+    load_features,
     photometric_loss,
     regularisation,
     slid_contour,
@@ -60,12 +71,8 @@ LANDMARKS = (*CONTOUR, *FIXED_LANDMARKS)  # the paper's 66 (Saragih et al., 2011
 
 
 def chosen(points: Tensor, landmarks: tuple[int, ...]) -> Tensor:
-    """Some of the 68 landmarks [B, 68, C]."""
+    """Select some of the 68 landmarks [B, 68, C]."""
     return points.index_select(1, on_device(points.device, torch.tensor, landmarks))
-
-
-# Side of the depth map of unwrapping: so many times the crop's, but at most _DEPTH_PX.
-_DEPTH_PX, _DEPTH_PER_PX = 512, 3
 
 
 @dataclass(frozen=True)
@@ -87,34 +94,30 @@ class PosedHeads(Batch):
 
 def pose_heads(model: MorphableModel, estimate: GeometryEstimate) -> PosedHeads:
     """v^c = R v(alpha, beta) + t, with as many leading shapes of the model as there are coefficients."""
-    head = leading(model, estimate.alpha.shape[1], estimate.beta.shape[1])
-    turned = head.vertices(estimate.alpha, estimate.beta) @ estimate.rotation.mT
-    vertices = turned + estimate.translation_m[:, None]
+    identities, expressions = estimate.alpha.shape[1], estimate.beta.shape[1]
+    head = replace(
+        model,
+        identity=model.identity[:identities],
+        expression=model.expression[:expressions],
+        expression_names=model.expression_names[:expressions],
+    )
+    rotated = head.vertices(estimate.alpha, estimate.beta) @ estimate.rotation.mT
+    vertices = rotated + estimate.translation_m[:, None]
     return PosedHeads(vertices, estimate.rotation, chosen(head.landmarks(vertices), FIXED_LANDMARKS))
-
-
-def leading(model: MorphableModel, identities: int, expressions: int) -> MorphableModel:
-    """Keep the leading shapes of a model, as many as a Geometry Network has coefficients."""
-    identity, expression = model.identity[:identities], model.expression[:expressions]
-    names = model.expression_names[:expressions]
-    return replace(model, identity=identity, expression=expression, expression_names=names)
 
 
 @dataclass(frozen=True)
 class UnwrappedHeads(Batch):
-    """Textures [B, 3, T, T] with unseen texels filled, visibility [B, 1, T, T] and normals [B, 3, T, T]."""
+    """B unwrapped heads: textures with unseen texels filled, visibility and normals, [B, C, T, T]."""
 
     texture: Tensor
     visible: Tensor
     normals: Tensor
 
 
-def unwrap_images(images: Tensor, heads: PosedHeads, camera: Camera, side: int) -> UnwrappedHeads:
+def unwrap_images(images: Tensor, heads: PosedHeads, side: int) -> UnwrappedHeads:
     """Unwrap images [B, 3, S, S] of the heads: T_s and N_s."""
-    triangles = on_device(images.device, grid_triangles)
-    depth_px, samples = min(_DEPTH_PX, _DEPTH_PER_PX * camera.width_px), math.ceil(camera.width_px / side)
-    settings = UnwrapSettings(depth_side_px=depth_px, samples=samples, measured=False)
-    texture, visible = unwrap(images, heads.vertices, triangles, camera, side, settings)
+    texture, visible = unwrap_crops(images, heads.vertices, side)
     return UnwrappedHeads(inpaint(texture, visible), visible[:, None], head_normals(heads, side))
 
 
@@ -140,7 +143,7 @@ _SHEET_ROWS, _SHEET_PX = 8, 256
 
 @dataclass(frozen=True)
 class JointSettings:
-    """The paper's settings."""
+    """Settings of the stage; the defaults are the paper's."""
 
     crop_px: int = 512
     texture_side: int = 512
@@ -162,12 +165,11 @@ class _Relit:
 
 
 class JointObjective(Objective):
-    """The paper's loss on a prepared dataset's pairs, and on photos.
+    """Minimise the paper's loss on a prepared dataset's pairs, and on photos.
 
-    Without `geometry` heads are fitted to the crops' landmarks, and the geometry terms are left out. `model`
-    is the face model of the coefficients.
-    `appearance` is V_f, `light` S_f; the term of one that is missing is left out. They are frozen and not
-    saved.
+    Without `geometry`, heads are fitted to the crops' landmarks, and the geometry terms are omitted. `model`
+    is the face model of the coefficients. `appearance` is V_f, `light` S_f; without one, its term is omitted.
+    They are frozen and not saved.
     """
 
     chooses_by = "si_mse"
@@ -187,7 +189,7 @@ class JointObjective(Objective):
         super().__init__(trained, _provenance(dataset, model, photos, appearance, light))
         self.settings = settings
         self.photos = photos
-        self.skips_networks = photos is not None  # photos train the geometry alone
+        self.skips_networks = photos is not None  # photos train only the geometry
         self.feature_networks = nn.ModuleDict(
             {
                 name: network.requires_grad_(False).eval()
@@ -206,11 +208,10 @@ class JointObjective(Objective):
         self._validation: dict[str, list[CropPairs]] | None = None
         network: Any = reflectance  # of any form (`network/reflectance.py`)
         if network.rig_lights and not network.has_mean_face:
-            textures = DatasetTextures(dataset, model, 0, {}, {}, network.rig_lights)
-            network.set_mean_face(*textures.mean_face())
+            network.set_mean_face(*mean_face_of(model, network.rig_lights))
 
     def compile(self, *args: Any, **kwargs: Any) -> None:
-        """Compile the networks alone; shapes in the rasterizer depend on what the camera sees."""
+        """Compile only the networks; shapes in the rasterizer depend on the camera's view."""
         called = {"reflectance": ("encode", "decode"), "geometry": ("forward",)}
         for name, network in (*self.networks.items(), *self.feature_networks.items()):
             for function in called.get(name, ("layers",)):
@@ -226,14 +227,14 @@ class JointObjective(Objective):
         return self._train.draw(count, generator_of, step)
 
     def forward(self, batch: CropPairs | PhotoCrops) -> dict[str, Tensor]:
-        """Compute the weighted terms: landmarks and regularisation for both, the others for pairs alone."""
+        """Compute the weighted terms: landmarks and regularisation for both, the others only for pairs."""
         if isinstance(batch, PhotoCrops):
             terms = self._geometry_terms(*self._heads(batch.crops, batch.landmarks_px), batch.landmarks_px)
             return {name: term.mean() for name, term in terms.items()}
         detected_px = torch.cat([batch.source_landmarks_px, batch.target_landmarks_px])
         estimate, heads = self._heads(torch.cat([batch.source, batch.target]), detected_px)
         terms = self._geometry_terms(estimate, heads, detected_px) if self._regresses else {}
-        # Times two, for the mean is over twice the samples: source and target each add their terms.
+        # times two: the mean is over twice the samples, because source and target each add their terms
         result = {name: 2 * term.mean() for name, term in terms.items()}
         relit = self._relit(batch, heads)
         return result | {name: term.mean() for name, term in self._image_terms(batch, relit).items()}
@@ -271,12 +272,12 @@ class JointObjective(Objective):
     def _relit(self, batch: CropPairs, heads: PosedHeads) -> _Relit:
         """Relight and pose the sources of pairs as their targets; `heads` are of both, sources first.
 
-        Sources and targets are unwrapped together, for the device then waits once for the host.
+        Sources and targets are unwrapped together, so that the device waits only once for the host.
         """
         side, count = self.settings.texture_side, len(batch.source)
         target = heads.each(lambda x: x[count:])
         images = torch.cat([batch.source, batch.target]) if self.feature_networks else batch.source
-        faces = unwrap_images(images, heads.each(lambda x: x[: len(images)]), self.camera, side)
+        faces = unwrap_images(images, heads.each(lambda x: x[: len(images)]), side)
         face = faces.each(lambda x: x[:count])
         network: Any = self.networks["reflectance"]
         with self.mixed_precision():
@@ -297,17 +298,20 @@ class JointObjective(Objective):
         texture = MaskedPair(relit.texture, relit.truth.texture, (relit.truth.visible > 0).float())
         with self.mixed_precision():
             if "appearance" in self.feature_networks:
-                image = MaskedPair(relit.image, batch.target, relit.mask)
-                appearance = appearance_loss(self.features["appearance"], image, texture)
+                image, features = (
+                    MaskedPair(relit.image, batch.target, relit.mask),
+                    self.features["appearance"],
+                )
+                appearance = image.distance(features) + texture.distance(features)
                 terms["appearance_features"] = weights.features * appearance
             if "light" in self.feature_networks:
-                terms["light_features"] = weights.features * light_loss(self.features["light"], texture)
+                terms["light_features"] = weights.features * texture.distance(self.features["light"])
         return terms
 
     def measure(self) -> None:
         """Measure the powers of the feature networks' layers, on targets spread over the training pairs.
 
-        The first process alone measures.
+        Only rank 0 measures.
         """
         networks: Any = self.feature_networks.items()
         for name, network in networks:
@@ -315,7 +319,7 @@ class JointObjective(Objective):
             powers = torch.zeros(len(FEATURE_LAYERS), device=self.device)
             if process_rank() == 0:
                 pairs = spread_pairs(self._train, _TARGETS_MEASURED, lambda pair: True)
-                targets = (self._train.read(pair).target.to(self.device) for pair in pairs)
+                targets = (self._train.read_target(pair).to(self.device) for pair in pairs)
                 seen = (
                     channels_apart(target, colour_shares(target)) if apart else target for target in targets
                 )
@@ -327,8 +331,7 @@ class JointObjective(Objective):
         """Measure the images' Si-MSE, clipped at white, for the same and another pose; and landmarks.
 
         `landmarks_iod` is the mean error of the 66 landmarks over the distance of the outer eye corners.
-        `tint_red` and `tint_blue` are red and blue over green of all faces, over those of the truth: 1 and 1
-        where skin has its colour.
+        `tint_red` and `tint_blue` are red and blue over green of all faces, relative to the ground truth.
         """
         if self._validation is None:
             self._validation = self._held_out_pairs()
@@ -359,7 +362,7 @@ class JointObjective(Objective):
         return Validation(metrics, np.concatenate(rows))
 
     def _held_out_pairs(self) -> dict[str, list[CropPairs]]:
-        """Validation pairs by kind; a dataset of one camera has no other pose."""
+        """Read validation pairs by kind; a dataset of one camera has no other pose."""
 
         def same(pair: Pair) -> bool:
             return pair.source_camera == pair.target_camera
@@ -369,13 +372,11 @@ class JointObjective(Objective):
             kind: spread_pairs(self._held_out, self.settings.validation_pairs, wanted)
             for kind, wanted in kinds.items()
         }
-        return {
-            kind: [self._held_out.read(pair) for pair in pairs] for kind, pairs in chosen.items() if pairs
-        }
+        return {kind: self._held_out.read(pairs) for kind, pairs in chosen.items() if pairs}
 
 
 def _landmark_error(heads: PosedHeads, batch: CropPairs, camera: Camera) -> Tensor:
-    """Mean landmark error over the distance of the outer eye corners, of sources and targets [2 B]."""
+    """Return mean landmark errors [2 B] of sources and targets over the distance of the outer eye corners."""
     detected_px = torch.cat([batch.source_landmarks_px, batch.target_landmarks_px])
     distance_px = (heads.landmarks_px(detected_px, camera) - chosen(detected_px, LANDMARKS)).norm(dim=-1)
     left, right = (detected_px[:, corner] for corner in OUTER_EYE_CORNERS)
@@ -383,7 +384,7 @@ def _landmark_error(heads: PosedHeads, batch: CropPairs, camera: Camera) -> Tens
 
 
 def _sheet_row(batch: CropPairs, relit: _Relit, camera: Camera) -> np.ndarray:
-    """Source, target, prediction in M_t and estimated normals of the first pair: [S, 4 S, 3]."""
+    """Draw source, target, prediction in M_t and estimated normals of the first pair: [S, 4 S, 3]."""
     normals = head_normals(relit.target, _SHEET_PX)
     shape, _ = render_textures((normals + 1) / 4, relit.target, camera)
     images = (batch.source, batch.target, relit.image * relit.mask, shape)
@@ -397,9 +398,51 @@ def _provenance(
     appearance: nn.Module | None,
     light: nn.Module | None,
 ) -> dict[str, Any]:
-    """Provenance of the dataset, the feature losses and the photos."""
+    """Return the provenance of the dataset, the feature losses and the photos."""
     published = isinstance(appearance, VggFeatures)
     of = VGG16_LICENCE if published else "trained on people and lights of a dataset (--appearance-features)"
     terms = [name for name, there in ((f"V_f, {of}", appearance), ("S_f", light)) if there is not None]
-    found = {"feature_losses": terms, "photos": len(photos.paths) if photos else 0}
-    return provenance_of(dataset, model) | found
+    count = len(photos.paths) if photos else 0
+    return provenance_of(dataset, model) | {"feature_losses": terms, "photos": count}
+
+
+def build(run: Run) -> Objective:
+    """Make the objective of the stage; detect faces in new photos."""
+    options, dataset = run.options, run.dataset()
+    side = run.crop_side(dataset)
+    appearance, light = _appearance(run, side), run.light_features(side)
+    if options.preset == "paper" and (appearance is None or light is None):
+        raise UsageError(
+            "the paper's loss needs V_f and S_f; pass --vgg-weights imagenet (553 MB), a file of it, or "
+            "--appearance-features FILE, and --light-features FILE, checkpoints of `facerf train --stage "
+            f"appearance-features --texture-size {side}` and of the stage light-features"
+        )
+    require_crops(dataset, dataset.crop_px, side)
+    reflectance, geometry = run.reflectance(side), None  # without one, heads are fitted to landmarks
+    if options.geometry == "network":
+        geometry = run.geometry(mean_translation_m(dataset))
+    photos = None
+    if options.photos:
+        items = collect_items([str(options.photos)], options.output, PHOTO_SUFFIXES)
+        cache = _cache_of(options.photos, options.output)
+        photos = open_photos([item.input_path for item in items], cache, run.people, side, options.jobs)
+    settings = JointSettings(side, side, weights=run.training.loss, seed=options.settings.seed)
+    model = load_face_model(options.fit_with)  # whatever fitted the dataset
+    kind = run.objective(JointObjective)
+    objective: Objective = kind(dataset, model, reflectance, geometry, appearance, light, photos, settings)
+    return objective
+
+
+def _appearance(run: Run, side: int) -> nn.Module | None:
+    """Load the frozen V_f, if the options name one."""
+    options = run.options
+    if options.appearance_features:
+        network: nn.Module = load_features(options.appearance_features, "appearance_features", side)
+        return network
+    return load_vgg(options.vgg_weights) if options.vgg_weights else None
+
+
+def _cache_of(photos: Path, output: Path) -> Path:
+    """Return the folder of faces found in photos: next to them for all runs, or the run's if not writable."""
+    folder = photos if photos.is_dir() else photos.parent
+    return folder / ".facerf-faces" if os.access(folder, os.W_OK) else output / "photos"

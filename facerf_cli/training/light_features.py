@@ -1,13 +1,13 @@
 """Stage `light-features`: S_f learns to predict the direction of the single light of a texture.
 
 The paper trains S_f 'to predict the light direction from images' after Meka et al. (*Deep reflectance
-fields*, 2019) and gives no details. Its features respond to shading, shadows and highlights, which the loss
-L_L compares. Textures are the Reflectance Network's targets, of one light each, black where the target pose
-does not see the face.
+fields*, 2019), without details. Its features respond to shading, shadows and highlights, which the loss L_L
+compares. Textures are the Reflectance Network's targets, of one light each, black if the target pose does not
+see the face there.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -16,16 +16,17 @@ from torch import Tensor
 
 from facerf_cli.dataset.crops import CropPairs, open_pairs, spread_pairs
 from facerf_cli.dataset.dataset import Dataset, provenance_of
-from facerf_cli.dataset.light_crops import LightCrops, LightStacks, LightTextures
-from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.dataset.faces import DatasetFaces, LightTextures, LitCrops
+from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.network.features import AppearanceNetwork, LightNetwork
 from facerf_cli.network.inputs import concatenate, head_rotation, resize
 from facerf_cli.synth.bank.texture_samples import SampleSource
+from facerf_cli.training.build import Run
 from facerf_cli.training.objective import Objective, Validation
 from facerf_cli.training.sheets import tiled
 from facerf_cli.training.texture import HeadsObjective, HeadsSettings
 
-_NORMALS_SIDE = 64  # texels along a side of the normals from which head rotations are computed
+_NORMALS_SIDE = 64  # texels along a side of the normals that head rotations are computed from
 _SHEET_FACES, _CPU = 6, torch.device("cpu")
 _HEADS = HeadsSettings()
 
@@ -37,27 +38,27 @@ class LightFeaturesObjective(HeadsObjective):
 
     def __init__(
         self,
-        source: SampleSource | LightStacks,
+        source: SampleSource | DatasetFaces,
         network: LightNetwork | None = None,
         settings: HeadsSettings = _HEADS,
     ) -> None:
         super().__init__("light_features", network or LightNetwork(), source, settings)
-        if not isinstance(source, LightStacks):
+        if not isinstance(source, DatasetFaces):
             self.mean_normals = resize(source.mean_face()[0][None], _NORMALS_SIDE)[0]
 
-    def draw_head(self, head: Tensor, generator: torch.Generator) -> LightTextures | LightCrops:
-        if isinstance(self.source, LightStacks):
-            return self.source.draw(head, self.settings.lights, generator)
+    def draw_head(self, head: Tensor, generator: torch.Generator) -> LightTextures | LitCrops:
+        if isinstance(self.source, DatasetFaces):
+            return self.source.draw_lights(head, self.settings.lights, generator)
         sample = self.source.draw(head, self.settings.lights, generator)
         seen = (sample.weight > 0).float()
         head_to_camera = head_rotation(self.mean_normals, sample.normals_target)
         lights_head = sample.lights @ head_to_camera  # row vectors: R^T w
         return LightTextures(sample.target * seen[:, None], lights_head, head)
 
-    def _unwrapped(self, batch: LightTextures | LightCrops) -> LightTextures:
-        return batch.unwrapped(self.network.settings.side) if isinstance(batch, LightCrops) else batch
+    def _unwrapped(self, batch: LightTextures | LitCrops) -> LightTextures:
+        return batch.unwrapped(self.source.side) if isinstance(batch, LitCrops) else batch
 
-    def forward(self, batch: LightTextures | LightCrops) -> dict[str, Tensor]:
+    def forward(self, batch: LightTextures | LitCrops) -> dict[str, Tensor]:
         """Compute the term `light`, a mean over faces and lights."""
         faces = self._unwrapped(batch)
         with self.mixed_precision():
@@ -79,25 +80,25 @@ class LightFeaturesObjective(HeadsObjective):
 
 
 def _cosines(network: LightNetwork, batch: LightTextures) -> Tensor:
-    """Cosines between predicted and true directions [B, L]."""
+    """Return cosines [B, L] between predicted and true directions."""
     predicted = network(batch.textures.flatten(0, 1)).view(batch.lights_head.shape)
     return (predicted * batch.lights_head).sum(-1)
 
 
 def _sheet(network: LightNetwork, batch: LightTextures) -> np.ndarray:
-    """Three rows for some faces: textures, balls under the true lights, balls under the predicted lights.
+    """Draw three rows for each face: textures, and balls under the true and under the predicted lights.
 
     The balls are seen from the front, in the head's frame.
     """
     rows = []
     for textures, lights in zip(batch.textures[:_SHEET_FACES], batch.lights_head[:_SHEET_FACES], strict=True):
         predicted = network(textures.to(next(network.parameters()).device)).cpu()
-        rows += [textures, *(_balls(one, textures.shape[-1]) for one in (lights, predicted))]
+        rows += [textures, *(_balls(directions, textures.shape[-1]) for directions in (lights, predicted))]
     return tiled(rows)
 
 
 def _balls(lights: Tensor, side: int) -> Tensor:
-    """Grey balls [N, 3, side, side] under lights [N, 3], a little brighter than the black background."""
+    """Draw grey balls [N, 3, side, side] under lights [N, 3], slightly brighter than the background."""
     along = torch.linspace(-1, 1, side) * 1.05
     y, x = torch.meshgrid(-along, along, indexing="ij")
     inside = 1 - x**2 - y**2
@@ -108,10 +109,10 @@ def _balls(lights: Tensor, side: int) -> Tensor:
 
 @dataclass(frozen=True)
 class AppearanceObjectiveSettings:
-    """Held-out pairs of people that are not trained on, and training pairs that are left out."""
+    """Number of held-out pairs, and of training pairs that are left out."""
 
     held_out_pairs: int = 48
-    every: int = 10  # of the training pairs, one is left out to measure the people
+    every: int = 10  # one in this many training pairs is left out to measure the people
 
 
 class AppearanceObjective(Objective):
@@ -129,11 +130,11 @@ class AppearanceObjective(Objective):
         super().__init__({"appearance_features": network}, provenance_of(dataset, model))
         pairs = open_pairs(dataset, "train", network.settings.side)
         kept = [pair for place, pair in enumerate(pairs.pairs) if place % settings.every]
-        self._train = pairs.of(kept)
-        self._left_out = pairs.of(pairs.pairs[:: settings.every])
+        self._train = replace(pairs, pairs=kept)
+        self._left_out = replace(pairs, pairs=pairs.pairs[:: settings.every])
         self._held_out = open_pairs(dataset, "validation", network.settings.side)
         self.settings = settings
-        self._validation: list[list[CropPairs]] | None = None  # of people that are known, and of others
+        self._validation: list[list[CropPairs]] | None = None  # of known people, and of others
 
     def draw(self, count: int, generator_of: Callable[..., torch.Generator], step: int) -> CropPairs:
         return self._train.draw(count, generator_of, step)
@@ -159,8 +160,7 @@ class AppearanceObjective(Objective):
             count = self.settings.held_out_pairs
             readers = (self._left_out, self._held_out)
             self._validation = [
-                [reader.read(pair) for pair in spread_pairs(reader, count, lambda pair: True)]
-                for reader in readers
+                reader.read(spread_pairs(reader, count, lambda pair: True)) for reader in readers
             ]
         known, strangers = self._validation
         right, angles = [], []
@@ -176,3 +176,20 @@ class AppearanceObjective(Objective):
             "recognised": float(torch.cat(right).double().mean()),
         }
         return Validation(metrics, None)
+
+
+def build(run: Run) -> Objective:
+    """Make the objective of the stage `light-features`."""
+    network = run.features("light_features", run.texture_side)
+    settings = HeadsSettings(held_out_heads=run.sizes.held_out_heads)
+    objective: Objective = run.objective(LightFeaturesObjective)(run.faces(), network, settings)
+    return objective
+
+
+def build_appearance(run: Run) -> Objective:
+    """Make the objective of the stage `appearance-features`: V_f on a dataset's crops."""
+    dataset = run.dataset()
+    network = run.features("appearance_features", run.crop_side(dataset), people=len(dataset.subjects))
+    model = load_face_model(dataset.face_model)
+    objective: Objective = run.objective(AppearanceObjective)(dataset, model, network)
+    return objective

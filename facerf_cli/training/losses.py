@@ -1,14 +1,14 @@
-"""Loss terms: the default form's own, and the paper's four ('Loss Functions'), each before its weight.
+"""Loss terms: the default form's own, and the paper's four ('Loss Functions'), each without its weight.
 
-The paper leaves open the units of its terms. Here they are chosen so that the terms have comparable size at
-its weights:
+The paper does not state the units of its terms. Here they are chosen so that the terms have comparable size
+at its weights:
 - a squared norm is the mean over points or coefficients, an L1 norm the mean over the mask's pixels and
   channels, so that a weight means the same at every size of crop and model;
-- landmarks are in units of half the crop's side, as for image coordinates from -1 to 1;
-- radiance is scene-linear, exposed as in `dataset/crops.py`; feature networks see it as sRGB
+- landmarks are in units of half the crop's side: image coordinates run from -1 to 1;
+- radiance is scene-linear, exposed by `dataset/crops.py`; feature networks see it as sRGB
   (`network/features.py`);
-- S_f and a V_f that facerf trained see each colour channel by itself, over the target's share of it
-  (`channels_apart`): their filters prefer colours by accident, and would tint what is uncertain;
+- S_f and a V_f that facerf trained see each colour channel separately, divided by the target's mean of it
+  (`channels_apart`): their filters happen to prefer some colours, and would tint uncertain areas;
 - textures are compared where the target's camera sees the face; the target's texture gets no gradient.
 """
 
@@ -27,18 +27,18 @@ from facerf_cli.network.inputs import from_root, to_root
 from facerf_cli.training.settings import PaperWeights as PaperWeights
 
 _SLOPE_WEIGHT = 0.6  # of differences between neighbouring texels
-_RADIANCE_WEIGHT = 16.0  # of squared errors of radiance, as in Si-MSE, against L1 on roots
-_WHITE = 1.0  # radiance at which a camera clips, at the exposure of samples
+_RADIANCE_WEIGHT = 16.0  # of squared errors of radiance, which Si-MSE measures, against L1 on roots
+_WHITE = 1.0  # radiance that a camera clips at the exposure of samples
 _PAPER = PaperWeights()
 _DIM, _LEAST_SHARE = 1e-3, 0.1  # radiance below which a colour is noise; of a channel in a mean colour of 1
 _BRIGHTEST_ROOT = 1.25  # above it a photograph clips
 
 
 def root_loss(root: Tensor, target: Tensor, weight: Tensor) -> Tensor:
-    """L1 on roots (`to_root`) and on differences of neighbouring roots, plus squared errors of radiance.
+    """Add L1 on roots (`to_root`), L1 on differences of neighbouring roots, and squared errors of radiance.
 
     root [B, L, 3, T, T] is the prediction's root (may be negative), target [B, L, 3, T, T] linear,
-    weight [B, 1, T, T] is positive where the target pose sees the face. The mean of the faces' means.
+    weight [B, 1, T, T] is positive where the target pose sees the face. Returns the mean of the faces' means.
     """
     wanted = to_root(target.clamp(0, 4))
     mask = weight[:, None]
@@ -54,7 +54,7 @@ def root_loss(root: Tensor, target: Tensor, weight: Tensor) -> Tensor:
 
 
 def si_mse(prediction: Tensor, target: Tensor, weight: Tensor) -> Tensor:
-    """Mean squared error [B, L] after the best single scale (Si-MSE; Zhou et al., ICCV 2019).
+    """Return mean squared errors [B, L] after the best single scale (Si-MSE; Zhou et al., ICCV 2019).
 
     prediction, target [B, L, 3, T, T] linear; weight [B, 1, T, T].
     """
@@ -66,12 +66,12 @@ def si_mse(prediction: Tensor, target: Tensor, weight: Tensor) -> Tensor:
 
 
 def clipped_si_mse(prediction: Tensor, target: Tensor, weight: Tensor) -> Tensor:
-    """`si_mse` of radiance clipped at white; without clipping a few highlights outweigh all faces."""
+    """Return `si_mse` of radiance clipped at white; otherwise a few highlights outweigh all faces."""
     return si_mse(prediction.clamp(max=_WHITE), target.clamp(max=_WHITE), weight)
 
 
 def landmark_loss(found_px: Tensor, detected_px: Tensor, side_px: int) -> Tensor:
-    """L_l [B]: mean squared distance of the mesh's and the detector's landmarks [B, N, 2].
+    """Return L_l [B]: mean squared distance of the mesh's and the detector's landmarks [B, N, 2].
 
     Lengths are in units of half the crop's side.
     """
@@ -79,34 +79,29 @@ def landmark_loss(found_px: Tensor, detected_px: Tensor, side_px: int) -> Tensor
     return difference.square().sum(-1).mean(1)
 
 
-@torch.no_grad()
-def closest_points(candidates_px: Tensor, detected_px: Tensor) -> Tensor:
-    """Index [B, N] of the candidate [B, C, 2] closest to each detected point [B, N, 2].
+def slid_contour(candidates_px: Tensor, detected_px: Tensor) -> Tensor:
+    """Select the candidates [B, C, 2] closest to the detected points [B, N, 2]: [B, N, 2].
 
     Contour landmarks slide on the mesh; the choice of their vertices has no gradient.
     """
-    return torch.cdist(detected_px, candidates_px, compute_mode="donot_use_mm_for_euclid_dist").argmin(-1)
-
-
-def slid_contour(candidates_px: Tensor, detected_px: Tensor) -> Tensor:
-    """Candidates [B, C, 2] closest to the detected points [B, N, 2]: [B, N, 2], with gradient."""
-    ids = closest_points(candidates_px, detected_px)
-    return candidates_px.gather(1, ids[..., None].expand(-1, -1, 2))
+    with torch.no_grad():
+        distances = torch.cdist(detected_px, candidates_px, compute_mode="donot_use_mm_for_euclid_dist")
+    return candidates_px.gather(1, distances.argmin(-1)[..., None].expand(-1, -1, 2))
 
 
 def regularisation(alpha: Tensor, beta: Tensor, weights: PaperWeights = _PAPER) -> Tensor:
-    """L_r [B]: weighted means of squared identity [B, Ki] and expression coefficients [B, Ke]."""
+    """Return L_r [B]: weighted means of squared identity [B, Ki] and expression coefficients [B, Ke]."""
     return weights.alpha * alpha.square().mean(1) + weights.beta * beta.square().mean(1)
 
 
 def photometric_loss(prediction: Tensor, target: Tensor, mask: Tensor) -> Tensor:
-    """L_p [B]: mean L1 difference of images [B, 3, H, W] in the mask [B, 1, H, W], 0 if it is empty."""
+    """Return L_p [B]: mean L1 difference of images [B, 3, H, W] in the mask [B, 1, H, W], or 0."""
     difference = ((prediction - target).abs() * mask).mean(1, keepdim=True)
     return difference.sum((1, 2, 3)) / mask.sum((1, 2, 3)).clamp_min(1.0)
 
 
 def colour_shares(target: Tensor) -> Tensor:
-    """Mean colour [B, 3, 1, 1] of images [B, 3, H, W], over its mean of the channels."""
+    """Return the mean colour [B, 3, 1, 1] of images [B, 3, H, W], over its mean of the channels."""
     mean = target.mean((2, 3), keepdim=True) + _DIM
     return (mean / mean.mean(1, keepdim=True)).clamp_min(_LEAST_SHARE)
 
@@ -114,14 +109,14 @@ def colour_shares(target: Tensor) -> Tensor:
 def channels_apart(images: Tensor, shares: Tensor) -> Tensor:
     """Make grey images [3 B, 3, H, W] of the channels of images [B, 3, H, W], over the `colour_shares`.
 
-    Those of the target give all channels the same brightness, so that no feature can prefer one to another.
+    The target's shares give all channels the same brightness, so that no feature can prefer one.
     """
     return (images / shares).flatten(0, 1)[:, None].expand(-1, 3, -1, -1)
 
 
 @dataclass(frozen=True)
 class Features:
-    """V_f or S_f, its layers' mean squares [layers] on training images, and if it sees channels apart."""
+    """V_f or S_f, its layers' mean squares [layers] on training images; `apart`: it sees single channels."""
 
     network: FeatureNetwork
     powers: Tensor
@@ -130,14 +125,17 @@ class Features:
 
 @dataclass(frozen=True)
 class MaskedPair:
-    """A prediction and its target [B, 3, H, W], linear, compared in the mask [B, 1, H, W]."""
+    """Prediction and target [B, 3, H, W], linear, compared in the mask [B, 1, H, W].
+
+    L_I is the `distance` of V_f of the image plus the one of the texture, L_L the one of S_f of the texture.
+    """
 
     prediction: Tensor
     target: Tensor
     mask: Tensor
 
     def distance(self, features: Features) -> Tensor:
-        """Distance [B] of the features of both, masked, relative to the features' powers."""
+        """Return the distance [B] of the features of both, masked, over the features' powers."""
         prediction, target = self.prediction * self.mask, self.target * self.mask
         shares = colour_shares(target)
         if features.apart:
@@ -148,32 +146,22 @@ class MaskedPair:
         return (distance.view(-1, 3) * shares.flatten(1)).mean(1)  # so that channels are pulled alike
 
 
-def appearance_loss(features: Features, image: MaskedPair, texture: MaskedPair) -> Tensor:
-    """L_I [B]: distance of V_f features, of the image and of the texture."""
-    return image.distance(features) + texture.distance(features)
-
-
-def light_loss(features: Features, texture: MaskedPair) -> Tensor:
-    """L_L [B]: distance of S_f features, which depend on the light's direction, of the texture."""
-    return texture.distance(features)
-
-
 def load_features(
     path: Path, name: Literal["light_features", "appearance_features"], side: int | None = None
 ) -> Any:
     """Load S_f ('light_features') or V_f ('appearance_features'), frozen, from a checkpoint of its stage.
 
-    Raises InputError where it was not trained on images of `side`: features of another scale mislead a loss.
+    Raises InputError if it was not trained on images of `side`: features of another scale mislead a loss.
     """
     network: Any = load_networks(path, LAYOUT_VERSION)[0].get(name)
     stage = name.replace("_", "-")
     if network is None:
-        raise InputError(f"{path}: has no network {name}; give one of `facerf train --stage {stage}`")
+        raise InputError(f"{path}: has no network {name}; use a checkpoint of `facerf train --stage {stage}`")
     trained = network.settings.side
     if side is not None and trained != side:
         raise InputError(
             f"{path}: its network {name} was trained on images of {trained} px, here they have {side}; train "
-            f"it with --stage {stage} --texture-size {side}, or give --texture-size {trained} here"
+            f"it with --stage {stage} --texture-size {side}, or pass --texture-size {trained} here"
         )
     network.eval().requires_grad_(False)
     return network

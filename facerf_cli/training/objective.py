@@ -1,4 +1,4 @@
-"""A training stage: its batches, its loss terms and its validation. `training/loop.py` takes its steps."""
+"""Base of the training stages: batches, loss terms and validation. `training/loop.py` takes the steps."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,24 +23,24 @@ class Validation:
 
 
 class Objective(nn.Module):
-    """A training stage: its batches, its loss terms and its validation.
+    """Base of the training stages: batches, loss terms and validation.
 
-    Subclasses set `held_out` and `settings` where they use `held_out_samples`; they implement `draw_one`,
-    `forward` and `validate`.
+    Subclasses implement `draw_one`, `forward` and `validate`; if they use `held_out_samples`, they set
+    `held_out` and `settings`.
     """
 
     chooses_by: str  # metric of `validate` (lower is better) that selects best.safetensors
     source_colours: SourceColours | None = None  # of a trained Reflectance Network's sources
     skips_networks: bool = False  # True if a batch may leave some weights without a gradient
     bf16: bool = False  # set by the loop, for `mixed_precision`
-    held_out: Any  # numbers of the people that are not trained on
-    settings: Any  # with `held_out_draws`, of each of them
+    held_out: Any  # numbers of the people that are only validated on
+    settings: Any  # with `held_out_draws`, the samples of each of them
     validation_seed: int = 12345
 
     def __init__(self, networks: dict[str, nn.Module], provenance: dict[str, Any]) -> None:
         """Make a stage that trains, averages and saves networks, by the names of `network/checkpoint.py`.
 
-        provenance: of the data, for the checkpoint; 'licence' is that of the whole.
+        provenance: Origin of the data, for the checkpoint; 'licence' covers all of it.
         """
         super().__init__()
         self.networks = nn.ModuleDict(networks)
@@ -49,10 +49,10 @@ class Objective(nn.Module):
         self._held_out_samples: list[Any] = []
 
     def draw(self, count: int, generator_of: Callable[..., torch.Generator], step: int) -> Batch:
-        """Draw `count` samples, sample i from `generator_of(i)` alone, independent of the others.
+        """Draw `count` samples; sample i depends only on `generator_of(i)`.
 
-        `generator_of(i, step)` is that of another step, for samples that share what costs much to read. A
-        choice for the whole batch is drawn from `seeded(seed, step)`. Runs in data-loading workers, on the
+        `generator_of(i, step)` belongs to another step, for samples that share data that is slow to read. A
+        choice for the entire batch is drawn from `seeded(seed, step)`. Runs in data-loading workers, on the
         CPU and without the networks.
         """
         return concatenate([self.draw_one(generator_of(i)) for i in range(count)])
@@ -66,7 +66,7 @@ class Objective(nn.Module):
         raise NotImplementedError
 
     def held_out_samples(self) -> list[Any]:
-        """Samples of the held-out people, B = 1, drawn once."""
+        """Return samples of the held-out people, B = 1, drawn once."""
         if not self._held_out_samples:
             self._held_out_samples = [
                 self.draw_held_out(int(person), seeded(self.validation_seed, int(person), index))
@@ -76,7 +76,7 @@ class Objective(nn.Module):
         return self._held_out_samples
 
     def measure(self) -> None:
-        """Measure what the losses need by the networks, once all processes have them on their device."""
+        """Measure constants of the losses with the networks, once all processes have them on their device."""
 
     def forward(self, batch: Any) -> dict[str, Tensor]:
         """Compute the weighted terms of the loss, each a mean over samples; the loop minimises their sum."""
@@ -87,12 +87,12 @@ class Objective(nn.Module):
         raise NotImplementedError
 
     def mixed_precision(self) -> torch.autocast:
-        """Context for the networks in `forward`; geometry and losses need single precision."""
+        """Return a context for the networks in `forward`; geometry and losses need single precision."""
         return mixed_precision(self.device, self.bf16)
 
     @property
     def network(self) -> Any:
-        """The network of a stage that trains one."""
+        """Network of a stage that trains one."""
         (network,) = self.networks.values()
         return network
 
@@ -102,12 +102,12 @@ class Objective(nn.Module):
 
 
 def seeded(*numbers: int) -> torch.Generator:
-    """Make a CPU generator from non-negative numbers; their order and count matter, too."""
+    """Make a CPU generator from non-negative numbers; their order and count also matter."""
     state = int(np.random.SeedSequence((len(numbers), *numbers)).generate_state(1, np.uint64)[0])
     return torch.Generator().manual_seed(state >> 1)
 
 
 def metrics_by_pose(errors: Tensor, same_pose: Tensor) -> dict[str, float]:
-    """Mean Si-MSE of errors [N]: of all, and by whether the target has the source's pose [N]."""
+    """Average the Si-MSE [N]: of all, and by whether the target has the source's pose [N]."""
     parts = {"": torch.ones_like(same_pose), "_same_pose": same_pose, "_other_pose": ~same_pose}
     return {f"si_mse{name}": float(errors[part].mean()) for name, part in parts.items() if part.any()}

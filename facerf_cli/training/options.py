@@ -1,70 +1,80 @@
-"""The options of `facerf train`. Light to import."""
+"""Options of `facerf train`. Light to import."""
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import UsageError
 from facerf_cli.option import DATA, LENGTH, LOSSES, RUN, SPEED, option
-from facerf_cli.training.settings import PRESETS, Preset, Stage, TrainSettings, preset_of, with_tables
+from facerf_cli.training.settings import PRESETS, STAGES, Preset, Stage, TrainSettings, preset_of, with_tables
 
 _UNITS_S = {"s": 1, "m": 60, "h": 3600}
 _DEFAULT_TIME = "2h"
 
 
 def _by_preset(value: Callable[[TrainSettings], Any]) -> str:
-    """Defaults of an option in all presets, for the help."""
+    """Return the defaults of an option in all presets, for the help."""
     default, paper, tiny = (value(PRESETS[name]) for name in ("default", "paper", "tiny"))
     return f"{default}; paper {paper}, tiny {tiny}"
 
 
-def _or_none(given: float | None, default: float | None) -> float | None:
-    """The default where none is given; None for 0."""
-    return (default if given is None else given) or None
+def _or_none(value: float | None, default: float | None) -> float | None:
+    """Return the default for None, and None for 0."""
+    return (default if value is None else value) or None
 
 
 def _seconds(text: str) -> float:
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([smh])", text)
     if not match or not float(match[1]):
-        raise UsageError(f"--max-time {text}: not a time; write a number and s, m or h, such as 45m")
+        raise UsageError(f"--max-time {text}: not a time; use a number and s, m or h, such as 45m")
     return float(match[1]) * _UNITS_S[match[2]]
 
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """The networks that are trained, their data and losses.
+    """Options of a training: its networks, data, losses, length and speed; None is the preset's value.
 
     Attributes:
-        output: Write the run to this folder.
-        preset: Use networks, losses and optimizer of the shipped checkpoint (default), of the paper, or
-            small ones for trials (tiny).
-        form: Train this form of the Reflectance Network: default, paper, or a class that you have installed.
-        objective: Train by an installed subclass of the stage's objective (docs/training.md).
-        resume: Continue the run in DIR from its last save; give the same options.
-        start_from: Start from a checkpoint; networks that the stage does not train are copied.
-        dataset: Train on a dataset of prepare-dataset and relight-dataset instead of synthetic heads.
-        texture_size: Unwrap a dataset to textures of this side; the stages joint and appearance-features
-            read its crops at this side, too.
-        photos: Train on photos of faces, too, in a fifth of the batches of the stage joint.
-        heads_from: Draw synthetic heads from this face model; of whole people, from several with commas.
-        fit_with: Fit this face model to the heads; a dataset's own model. In the stage joint it needs
-            --geometry landmarks.
-        heads: Bake so many synthetic heads.
-        views: Fit so many views of each head.
-        bank: Keep baked heads in this folder.
-        jobs: Bake or unwrap in so many processes.
+        output: Folder that the run is written to.
+        preset: Networks, losses and optimizer of the shipped checkpoint (default), of the paper, or small
+            ones for trials (tiny).
+        form: Form of the Reflectance Network to train: default, paper, or an installed class.
+        objective: Installed subclass of the stage's objective to train with (docs/training.md).
+        resume: Continue the run in DIR from its last save; use it with the same options.
+        start_from: Checkpoint to start from; networks that the stage does not train are copied.
+        dataset: Dataset of prepare-dataset and relight-dataset to train on, in place of synthetic heads.
+        texture_size: Side of the textures that a dataset is unwrapped to, in texels; in the stages joint and
+            appearance-features also of its crops.
+        photos: Folder of photos of faces to train on in a fifth of the batches of the stage joint.
+        heads_from: Face model that synthetic heads are drawn from; for whole people, several with commas.
+        fit_with: Face model that is fitted to the heads; for a dataset, its own model. In the stage joint it
+            requires --geometry landmarks.
+        heads: Number of synthetic heads to bake.
+        views: Number of views to fit for each head.
+        bank: Folder of baked heads.
+        jobs: Number of worker processes that bake heads or detect faces.
         vgg_weights: Add the feature loss of VGG-16 to the stage joint: imagenet downloads its weights; or a
             file.
-        appearance_features: Use a checkpoint of the stage appearance-features in place of --vgg-weights.
+        appearance_features: Checkpoint of the stage appearance-features to use in place of --vgg-weights.
         light_features: Add the feature loss on textures, with a checkpoint of the stage light-features.
         without_normals: Train the Reflectance Network without normal maps (ablation).
-        mean_face: Fit poses alone, with the mean face for everyone (ablation).
-        geometry: Train the Geometry Network, too, in the stage joint; or fit heads to landmarks and train
-            the Reflectance Network alone.
-        workers: Draw samples ahead in so many processes.
+        mean_face: Fit only poses, with the mean face for everyone (ablation).
+        geometry: In the stage joint, also train the Geometry Network, or fit heads to landmarks and train
+            only the Reflectance Network.
+        workers: Number of processes that draw samples ahead.
+        learning_rate: Highest learning rate.
+        steps: Number of steps of the run.
+        max_time: Duration of the run, such as 90s, 45m or 2h, summed over all resumptions.
+        validate_every: Number of steps between validations on held-out people, each followed by a save.
+        batch: Samples per step, of all processes together.
+        gradient_clip: Largest norm of the gradient; a larger one is scaled down. 0: no clipping.
+        ema_decay: Decay of the weights' average over steps, which is validated and saved; 0: no average.
+        bf16: Train in mixed precision (bfloat16) if the device has instructions for it.
+        accumulate: Number of parts that a process's share of a batch is divided into, to save memory.
+        compile: Compile the networks with torch; the first steps take minutes.
     """
 
     settings: Settings
@@ -80,7 +90,7 @@ class TrainOptions:
     objective: str | None = option(None, metavar="MODULE:CLASS", shown_default="the stage's", panel=LOSSES)
     stage: Stage = option(
         "reflectance",
-        f"Train the networks of a stage: {', '.join(get_args(Stage))}.",
+        f"Stage whose networks are trained: {', '.join(STAGES)}.",
         "STAGE",
         shown_default="joint with --preset paper, else reflectance",
         typed=Stage | None,
@@ -120,27 +130,6 @@ class TrainOptions:
     workers: int | None = option(
         None, shown_default="1 on a CPU of more than one core, 4 on a GPU", least=0, panel=SPEED
     )
-    training: TrainSettings = field(default_factory=TrainSettings)
-    typed: dict[str, Any] = field(default_factory=dict)  # the options that were given, by name
-
-
-@dataclass(frozen=True)
-class PaceOptions:
-    """Length and speed of a run; None is the preset's.
-
-    Attributes:
-        learning_rate: Set the highest learning rate.
-        steps: Stop after so many steps.
-        max_time: Stop after a time, such as 90s, 45m or 2h, summed over all resumptions.
-        validate_every: Validate on held-out people, and save, every so many steps.
-        batch: Use so many samples a step, of all processes together.
-        gradient_clip: Scale a larger norm of the gradient down to this; 0 does not.
-        ema_decay: Validate and save the weights averaged over steps with this decay; 0 does not.
-        bf16: Train in mixed precision (bfloat16), where the device has instructions for it.
-        accumulate: Take a process's share of a batch in so many parts, one after another, for less memory.
-        compile: Compile the networks with torch; the first steps take minutes.
-    """
-
     learning_rate: float | None = option(
         None,
         shown_default=_by_preset(lambda settings: settings.optimizer.learning_rate),
@@ -184,16 +173,16 @@ class PaceOptions:
         panel=RUN,
     )
 
-    def of_run(self, options: TrainOptions, tables: Mapping[str, Any]) -> TrainSettings:
-        """The preset's settings with those of a configuration file's tables, then with these."""
-        training = with_tables(preset_of(options.preset, options.stage), tables)
+    def training(self, tables: Mapping[str, Any]) -> TrainSettings:
+        """Return the preset's settings, changed by a configuration file's tables, then by the options."""
+        training = with_tables(preset_of(self.preset, self.stage), tables)
         optimizer = training.optimizer
         max_seconds = _seconds(_DEFAULT_TIME) if self.max_time is self.steps is None else self.max_time
         return replace(
             training,
             steps=self.steps,
             max_seconds=max_seconds,
-            seed=options.settings.seed,
+            seed=self.settings.seed,
             compile=self.compile,
             accumulate=self.accumulate,
             optimizer=replace(optimizer, learning_rate=self.learning_rate or optimizer.learning_rate),
@@ -202,5 +191,5 @@ class PaceOptions:
             gradient_clip=_or_none(self.gradient_clip, training.gradient_clip),
             ema_decay=_or_none(self.ema_decay, training.ema_decay),
             # the gradients of the form paper overflow
-            bf16=training.bf16 and options.form != "paper" if self.bf16 is None else self.bf16,
+            bf16=training.bf16 and self.form != "paper" if self.bf16 is None else self.bf16,
         )

@@ -1,8 +1,8 @@
 """Stage `parsing`: the Parsing Network, on crops of synthetic portraits.
 
-The classes' loss is a cross-entropy with the matte as a soft target; it is the matte's, too, with an error of
-the matte and of its gradient. A landmark's error is weighed by the error that the network expects of it
-(Wood et al., *3D face reconstruction with dense landmarks*, 2022, Eq. 1).
+The classes' loss is a cross-entropy with the matte as a soft target; the matte's loss adds errors of the
+matte and of its gradient. A landmark's error is weighted by the error that the network predicts for it (Wood
+et al., *3D face reconstruction with dense landmarks*, 2022, Eq. 1).
 """
 
 from dataclasses import dataclass
@@ -18,12 +18,14 @@ from facerf_cli.network.inputs import concatenate
 from facerf_cli.network.parsing import Parsing, ParsingNetwork
 from facerf_cli.portrait.parse import CLASSES
 from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
+from facerf_cli.synth.bank.portraits import PortraitBankSettings, add_portraits
+from facerf_cli.training.build import Run
 from facerf_cli.training.objective import Objective, Validation
 from facerf_cli.training.sheets import FOUND_COLOUR, TRUE_COLOUR, in_rows, mark, tiled
 
 _SHEET_ROWS, _SHEET_COLUMNS = 6, 4
 _RARE = ("brows", "eyes", "lips", "mouth", "beard", "ears", "glasses", "headwear", "hand")
-_LEAST_EYES = 0.03  # sides of the crop; smaller distances of the eyes are taken as this
+_LEAST_EYES = 0.03  # lower bound of the distance of the eyes, in sides of the crop
 
 
 @dataclass(frozen=True)
@@ -71,20 +73,20 @@ class ParsingObjective(Objective):
     def forward(self, batch: PortraitCrops) -> dict[str, Tensor]:
         """Compute the weighted terms, each a mean over crops."""
         with self.mixed_precision():
-            found: Parsing = self.network(batch.crops)
+            parsing: Parsing = self.network(batch.crops)
         settings = self.settings
-        log_share = found.logits.float().log_softmax(1)
+        log_share = parsing.logits.float().log_softmax(1)
         covered = self.rarity[batch.label] * log_share.gather(1, batch.label[:, None])[:, 0]
         entropy = -(batch.alpha * covered + (1 - batch.alpha) * log_share[:, 0])
         matte = 1 - log_share[:, 0].exp()
         off = (matte - batch.alpha) * batch.weight
         edges = off.diff(dim=1).abs().mean() + off.diff(dim=2).abs().mean()
-        distance = (found.landmarks - batch.landmarks).norm(dim=-1)
-        log_error = found.log_error.clamp(-7, 1)
+        distance = (parsing.landmarks - batch.landmarks).norm(dim=-1)
+        log_error = parsing.log_error.clamp(-7, 1)
         likelihood = distance * (-log_error).exp() + 2 * log_error
         known = batch.known.float() * batch.present[:, None]
         count = known.sum().clamp_min(1)
-        presence = F.binary_cross_entropy_with_logits(found.presence, batch.present)
+        presence = F.binary_cross_entropy_with_logits(parsing.presence, batch.present)
         return {
             "classes": settings.classes * (entropy * batch.weight).mean(),
             "matte": settings.matte * (off.abs().mean() + edges),
@@ -97,9 +99,10 @@ class ParsingObjective(Objective):
     def validate(self) -> Validation:
         """Measure held-out people: IoU by class, error of the matte, landmarks in inter-ocular distances."""
         batch = concatenate(self.held_out_samples()).to(self.device)
-        found = self._found(batch)
+        parts = [self.network(crops) for crops in torch.split(batch.crops, 16)]
+        parsing = Parsing(*(torch.cat(part) for part in zip(*parts, strict=True)))
         label = torch.where(batch.alpha >= 0.5, batch.label, 0)
-        chosen, counted = found.logits.argmax(1), batch.weight > 0
+        chosen, counted = parsing.logits.argmax(1), batch.weight > 0
         overlap = {}
         for index, name in enumerate(CLASSES):
             either = ((label == index) | (chosen == index)) & counted
@@ -108,27 +111,23 @@ class ParsingObjective(Objective):
                 overlap[f"iou_{name}"] = float(both.sum() / either.sum())
         left, right = OUTER_EYE_CORNERS
         eyes = (batch.landmarks[:, left] - batch.landmarks[:, right]).norm(dim=-1).clamp_min(_LEAST_EYES)
-        percent = 100 * (found.landmarks - batch.landmarks).norm(dim=-1) / eyes[:, None]
+        percent = 100 * (parsing.landmarks - batch.landmarks).norm(dim=-1) / eyes[:, None]
         known = batch.known & (batch.present > 0)[:, None]
         whole = known[:, :68].all(1)
-        matte = ((1 - found.classes[:, 0]) - batch.alpha).abs()[counted].mean()
+        matte = ((1 - parsing.classes[:, 0]) - batch.alpha).abs()[counted].mean()
         metrics = {
             "mean_iou": float(np.mean(list(overlap.values()))),
             "matte_error": float(matte),
             "landmarks_percent": float(percent[:, :68][whole].median(1).values.mean()),
             "more_percent": float(percent[:, 68:][whole][known[whole, 68:]].median()),
-            "presence_wrong": float(((found.presence > 0) != (batch.present > 0)).float().mean()),
+            "presence_wrong": float(((parsing.presence > 0) != (batch.present > 0)).float().mean()),
             **overlap,
         }
         metrics["total"] = 1 - metrics["mean_iou"] + metrics["landmarks_percent"] / 20
-        return Validation(metrics, self._sheet(batch, found))
+        return Validation(metrics, self._sheet(batch, parsing))
 
-    def _found(self, batch: PortraitCrops) -> Parsing:
-        parts = [self.network(crops) for crops in torch.split(batch.crops, 16)]
-        return Parsing(*(torch.cat(part) for part in zip(*parts, strict=True)))
-
-    def _sheet(self, batch: PortraitCrops, found: Parsing) -> np.ndarray:
-        """Held-out crops with true landmarks in green and found ones in red, beside the found classes."""
+    def _sheet(self, batch: PortraitCrops, parsing: Parsing) -> np.ndarray:
+        """Draw held-out crops with true (green) and predicted (red) landmarks, and predicted classes."""
         palette = torch.from_numpy(np.random.default_rng(2).uniform(0.15, 1, (len(CLASSES), 3))).float()
         palette[0] = 0
         count, side = min(_SHEET_ROWS * _SHEET_COLUMNS, len(batch.crops)), batch.crops.shape[-1]
@@ -136,7 +135,19 @@ class ParsingObjective(Objective):
         for index in range(count):
             image, known = batch.crops[index].cpu().clone(), batch.known[index]
             mark(image, batch.landmarks[index][known].cpu() * side, TRUE_COLOUR)
-            mark(image, found.landmarks[index][known].cpu() * side, FOUND_COLOUR)
-            shares = found.classes[index].permute(1, 2, 0).cpu()
+            mark(image, parsing.landmarks[index][known].cpu() * side, FOUND_COLOUR)
+            shares = parsing.classes[index].permute(1, 2, 0).cpu()
             cells.append(torch.cat([image, (shares @ palette).permute(2, 0, 1)], 2))
         return np.asarray(srgb_to_linear(tiled(in_rows(cells, _SHEET_COLUMNS))))
+
+
+def build(run: Run) -> Objective:
+    """Make the objective of the stage; photograph synthetic people whose photos are missing."""
+    options, folder, held_out = run.options, run.bank / "portraits", run.sizes.held_out_heads
+    people, models, provenance = run.whole_people(held_out)
+    bank = PortraitBankSettings(views=1, photos=1, side_px=96) if run.is_tiny else PortraitBankSettings()
+    add_portraits(folder, models, people, options.jobs, options.settings.seed, bank)
+    stored = StoredPortraits(folder, run.backgrounds(run.bank), provenance)
+    settings = ParsingObjectiveSettings(held_out_people=held_out)
+    objective: Objective = run.objective(ParsingObjective)(stored, run.network("parsing"), settings)
+    return objective

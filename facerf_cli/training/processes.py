@@ -1,4 +1,4 @@
-"""The processes of torchrun that train one run together (docs/clusters.md); one process alone has rank 0."""
+"""Processes of torchrun that train one run together (docs/clusters.md); a single process has rank 0."""
 
 import datetime
 import os
@@ -19,13 +19,13 @@ _TIMEOUT = datetime.timedelta(hours=24)  # others wait while the first process b
 def joined_processes() -> Iterator[None]:
     """Join torchrun's group of processes, if the environment describes one, and leave it at the end.
 
-    Raises FacerfError where another process is lost.
+    Raises FacerfError if another process is lost.
     """
     if int(os.environ.get("WORLD_SIZE", "1")) < 2 or dist.is_initialized():
         yield
         return
-    # Imported once the group exists, it would keep the group (as defaults of its functions), whose threads
-    # then outlive the interpreter and abort the process.
+    # If it were imported once the group exists, defaults of its functions would keep the group, whose threads
+    # would outlive the interpreter and abort the process.
     import torch.distributed.nn
 
     backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
@@ -36,24 +36,24 @@ def joined_processes() -> Iterator[None]:
     except RuntimeError as error:
         if not isinstance(error, dist.DistError) and "gloo" not in str(error):
             raise
-        said = "another process of this run ended; its own message says why"
-        raise FacerfError(f"{said}; give the same line again with --resume") from error
+        ended = "another process of this run ended; see its own message"
+        raise FacerfError(f"{ended}, then run the same command with --resume") from error
     finally:
         dist.destroy_process_group()
 
 
 def process_count() -> int:
-    """Number of training processes."""
+    """Return the number of training processes."""
     return dist.get_world_size() if dist.is_initialized() else 1
 
 
 def process_rank() -> int:
-    """Index of this process; only process 0 writes files."""
+    """Return the index of this process; only process 0 writes files."""
     return dist.get_rank() if dist.is_initialized() else 0
 
 
 def process_device(device: torch.device) -> torch.device:
-    """GPU of this process where a machine has several; otherwise `device`."""
+    """Return the GPU of this process if a machine has several; otherwise `device`."""
     if device.type != "cuda" or process_count() == 1:
         return device
     own = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
@@ -63,7 +63,7 @@ def process_device(device: torch.device) -> torch.device:
 
 @contextmanager
 def first_process_first() -> Iterator[None]:
-    """Run a block in process 0, then in all others at once, so that they find the files that it made."""
+    """Run a block in process 0, then in all others, which find the files that it made."""
     if process_rank() > 0:
         _meet()
     yield
@@ -72,7 +72,7 @@ def first_process_first() -> Iterator[None]:
 
 
 def _meet() -> None:
-    """Wait for all processes, on the CPU, where a barrier would take a GPU."""
+    """Wait for all processes, on the CPU; a barrier would need a GPU."""
     mean_over_processes(torch.zeros(1))
 
 
@@ -84,7 +84,7 @@ def distributed(objective: nn.Module, skips_networks: bool) -> nn.Module:
 
 
 def broadcast_from_first(values: Tensor) -> Tensor:
-    """The values of process 0."""
+    """Return the values of process 0."""
     if process_count() > 1:
         dist.broadcast(values, 0)
     return values

@@ -1,11 +1,13 @@
-"""Settings of a training run: stage, optimizer, schedule, precision and length; and the presets.
+"""Settings of a training run: its stage, optimizer, schedule, precision and length; and the presets.
 
-The command line reads its defaults here, so this module imports no torch. Each run writes DIR/config.toml:
-[train] has options of the command line; [train.loss], [train.optimizer] and [train.schedule] have the rest.
+Presets are the files `presets/*.toml`. The command line reads its defaults here, so this module does not
+import torch. Each run writes DIR/config.toml: [train] contains options of the command line; [train.loss],
+[train.optimizer] and [train.schedule] contain the other settings.
 """
 
 import json
 import math
+import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -26,11 +28,42 @@ Stage = Literal[
     "parsing",
     "portrait",
 ]
-_BATCHES = {"parsing": 16, "portrait": 8}  # of stages that look at whole people
-FEATURE_STAGES = ("light-features", "appearance-features")  # of networks that a loss compares images with
-_BESIDE_THE_PAPER = (*FEATURE_STAGES, *_BATCHES)
 CONFIG = "config.toml"
 _BELOW_1 = ("rho", "betas", "floor")
+
+
+@dataclass(frozen=True)
+class StageEntry:
+    """How a stage is built, and which options it has.
+
+    Attributes:
+        build: Module and function that make its objective from a `Run` (`training/build.py`).
+        options: Options that apply to some stages, by name, and apply to this one.
+        networks: The networks that it trains, if they are not named like the stage.
+        in_paper: The preset paper trains it as the paper does.
+    """
+
+    build: str
+    options: frozenset[str]
+    networks: tuple[str, ...] = ()
+    in_paper: bool = True
+
+
+_HEADS = frozenset({"heads_from", "heads", "bank"})
+_CROPS = frozenset({"dataset", "texture_size"})
+_TEXTURES = _HEADS | _CROPS | {"views", "fit_with"}
+_REFLECTANCE = frozenset({"light_features", "form", "without_normals", "mean_face"})
+_JOINT = _CROPS | _REFLECTANCE | {"fit_with", "geometry", "photos", "vgg_weights", "appearance_features"}
+STAGES: dict[Stage, StageEntry] = {
+    "reflectance": StageEntry("texture:build", _TEXTURES | _REFLECTANCE),
+    "geometry": StageEntry("geometry:build", _HEADS),
+    "joint": StageEntry("joint:build", _JOINT, ("reflectance", "geometry")),
+    "light-features": StageEntry("light_features:build", _TEXTURES, in_paper=False),
+    "appearance-features": StageEntry("light_features:build_appearance", _CROPS, in_paper=False),
+    "diffuse-sh": StageEntry("diffuse_sh:build", _TEXTURES),
+    "parsing": StageEntry("parsing:build", _HEADS, in_paper=False),
+    "portrait": StageEntry("portrait:build", _HEADS | {"dataset"}, in_paper=False),
+}
 
 
 @dataclass(frozen=True)
@@ -59,7 +92,7 @@ class Cosine:
     floor: float = 0.02
 
     def factor(self, step: int, done: float) -> float:
-        """Factor of the learning rate at a step, from 0, when the share `done` of the run is over."""
+        """Return the factor of the learning rate at a step, from 0; `done` is the fraction of the run."""
         warm = min(1.0, (step + 1) / self.warmup_steps)
         return warm * (self.floor + (1 - self.floor) * 0.5 * (1 + math.cos(math.pi * min(done, 1.0))))
 
@@ -69,16 +102,16 @@ class Constant:
     """Constant learning rate."""
 
     def factor(self, step: int, done: float) -> float:
-        """Factor of the learning rate: 1."""
+        """Return the factor of the learning rate: 1."""
         return 1.0
 
 
 @dataclass(frozen=True)
 class PaperWeights:
-    """The paper's lambda_l, lambda_r, lambda_p and lambda_f, and lambda_alpha and lambda_beta of L_r.
+    """Weights of the paper: lambda_l, lambda_r, lambda_p, lambda_f; of L_r, lambda_alpha and lambda_beta.
 
-    With `channels_apart` S_f and a V_f of facerf compare the colour channels by themselves; ImageNet's V_f
-    always sees colours, as the paper's does.
+    With `channels_apart`, S_f and a V_f trained by facerf compare each colour channel separately; ImageNet's
+    V_f always sees colours, as in the paper.
     """
 
     landmarks: float = 25.0
@@ -90,11 +123,11 @@ class PaperWeights:
     channels_apart: bool = True
 
 
-# The groups of settings that a configuration file may change, and their kinds by name.
-KINDS: dict[str, dict[str, Any]] = {
-    "loss": {"PaperWeights": PaperWeights},
-    "optimizer": {"AdamW": AdamW, "Adadelta": Adadelta},
-    "schedule": {"Cosine": Cosine, "Constant": Constant},
+# The tables of settings that a configuration file may change, and their kinds.
+KINDS: dict[str, tuple[type[Any], ...]] = {
+    "loss": (PaperWeights,),
+    "optimizer": (AdamW, Adadelta),
+    "schedule": (Cosine, Constant),
 }
 
 
@@ -104,60 +137,80 @@ def _may_change(default: Any) -> Any:
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """Settings of the training loop; the defaults are the preset `default`."""
+    """Settings of the training loop."""
 
-    batch: int = 4  # samples a step, of all processes together
-    optimizer: AdamW | Adadelta = AdamW()
-    schedule: Cosine | Constant = Cosine()
-    gradient_clip: float | None = 1.0  # largest norm; None: no clipping
-    ema_decay: float | None = 0.998  # of the weights that are validated and saved; None: not averaged
-    bf16: bool = True
+    batch: int  # samples per step, of all processes together
+    optimizer: AdamW | Adadelta
+    schedule: Cosine | Constant
+    gradient_clip: float | None = None  # largest norm; None: no clipping
+    ema_decay: float | None = None  # of the weights that are validated and saved; None: not averaged
+    bf16: bool = False
     loss: PaperWeights = PaperWeights()  # of the stage joint
     seed: int = 0
     # What may differ between a run and its resumption.
     validate_every: int = _may_change(500)  # steps
-    steps: int | None = _may_change(None)  # the run ends after so many steps or max_seconds, if that is first
+    steps: int | None = _may_change(None)  # the run ends after this many steps or max_seconds
     max_seconds: float | None = _may_change(None)
     workers: int = _may_change(0)  # processes that draw batches; 0: the training process itself
     compile: bool = _may_change(False)
     accumulate: int = _may_change(1)  # parts of a step's batch, one after another in each process
 
     def done(self, step: int, seconds: float) -> float:
-        """Share of the run that is over before a step, counted from 0."""
+        """Return the fraction of the run that is over before a step, counted from 0."""
         by_steps = step / self.steps if self.steps else 0.0
         return max(by_steps, seconds / self.max_seconds if self.max_seconds else 0.0)
 
 
-PRESETS: dict[Preset, TrainSettings] = {
-    "default": TrainSettings(),
-    "paper": TrainSettings(
-        batch=1,
-        optimizer=Adadelta(),
-        schedule=Constant(),
-        gradient_clip=None,
-        ema_decay=None,
-        bf16=False,
-        validate_every=1000,
-    ),
-    "tiny": TrainSettings(
-        batch=2,
-        optimizer=AdamW(learning_rate=4e-3),
-        schedule=Cosine(warmup_steps=5),
-        ema_decay=0.9,
-        bf16=False,
-        validate_every=10,
-    ),
+@dataclass(frozen=True)
+class Sizes:
+    """Amounts of data and sizes of networks."""
+
+    heads: int = 240
+    views: int = 8
+    images: int = 24  # of each head, for the Geometry Network
+    texture_side: int = 128  # of a dataset's textures
+    joint_side: int = 256  # of the stage joint's crops and textures
+    held_out_heads: int = 12
+    light_width: float = 0.25  # of S_f and V_f; 1 is VGG-16's
+    bake_side: int = 128  # texels along a side of baked heads
+    rig_lights: int = 150  # that heads and the mean face are baked under
+
+
+_TABLES: dict[str, dict[str, Any]] = {
+    path.stem: tomllib.loads(path.read_text())
+    for path in sorted(Path(__file__).with_name("presets").glob("*.toml"))
 }
 
 
-def preset_of(preset: Preset, stage: Stage) -> TrainSettings:
-    """Settings of a preset; the paper's optimizer is for its own loss, not for networks besides it.
+def _training_of(preset: str) -> TrainSettings:
+    table = dict(_TABLES[preset]["training"])
+    kinds = {kind.__name__: kind for group in KINDS.values() for kind in group}
+    for group in ("optimizer", "schedule"):
+        values = dict(table[group])
+        table[group] = kinds[values.pop("name")](**values)
+    return TrainSettings(**table)
 
-    It does not say how those of its features were trained.
-    """
-    settings = PRESETS["default" if preset == "paper" and stage in _BESIDE_THE_PAPER else preset]
-    own = preset != "tiny" and stage in _BATCHES
-    return replace(settings, batch=_BATCHES[stage]) if own else settings
+
+PRESETS: dict[str, TrainSettings] = {preset: _training_of(preset) for preset in _TABLES}
+
+
+def preset_of(preset: Preset, stage: Stage) -> TrainSettings:
+    """Return a preset's settings for a stage."""
+    if preset == "paper" and not STAGES[stage].in_paper:
+        preset = "default"
+    batch = _TABLES[preset].get("batches", {}).get(stage)
+    return replace(PRESETS[preset], batch=batch) if batch else PRESETS[preset]
+
+
+def sizes_of(preset: Preset) -> Sizes:
+    """Return a preset's sizes."""
+    return Sizes(**_TABLES[preset].get("sizes", {}))
+
+
+def network_settings_of(preset: Preset, name: str, form: str) -> dict[str, Any]:
+    """Return a preset's settings of a network, as far as they differ from its form's."""
+    settings: dict[str, Any] = _TABLES[preset].get("networks", {}).get(f"{name} {form}", {})
+    return settings
 
 
 def with_tables(training: TrainSettings, tables: Mapping[str, Any]) -> TrainSettings:
@@ -167,53 +220,47 @@ def with_tables(training: TrainSettings, tables: Mapping[str, Any]) -> TrainSett
 
 
 def _changed(before: Any, name: str, table: Any) -> Any:
-    """A group of settings with a table's values; `name` in the table chooses another kind of it."""
-    where, kinds = f"--config: [train.{name}]", KINDS[name]
+    """Change a group of settings by a table, whose `name` may choose another kind of the group."""
+    from pydantic import ConfigDict, TypeAdapter, ValidationError  # takes a tenth of a second
+
+    where = f"--config: [train.{name}]"
     if not isinstance(table, Mapping):
-        raise UsageError(f"{where} is no table; write [train.{name}]")
+        raise UsageError(f"{where} is not a table; write [train.{name}]")
+    kinds = {kind.__name__: kind for kind in KINDS[name]}
     chosen = table.get("name", type(before).__name__)
     if chosen not in kinds:
-        raise UsageError(f"{where} name is {chosen!r}; give one of {', '.join(kinds)}")
-    values = asdict(before if kinds[chosen] is type(before) else kinds[chosen]())
-    for key in table.keys() - {"name"}:
-        if key not in values:
-            raise UsageError(f"{where} {key}: no such setting; give one of {', '.join(values)}")
-        values[key] = _like(values[key], table[key], f"{where} {key}")
-    return kinds[chosen](**values)
-
-
-def _like(default: Any, value: Any, where: str) -> Any:
-    """A value as true or false, or numbers of the default's kind and count, from 0 on."""
-    if isinstance(default, bool):
-        if not isinstance(value, bool):
-            raise UsageError(f"{where} is {value}; give true or false")
-        return value
-    several = isinstance(default, tuple)
-    numbers = list(value) if several and isinstance(value, list) else [value]
-    kind = int if isinstance(default, int) else (int, float)
-    most = 1.0 if where.endswith(_BELOW_1) else math.inf
-    sound = [isinstance(x, kind) and not isinstance(x, bool) and 0 <= x < most for x in numbers]
-    if not all(sound) or len(numbers) != (len(default) if several else 1):
-        wanted = f"{len(default)} numbers" if several else "a whole number" if kind is int else "a number"
-        raise UsageError(f"{where} is {value}; give {wanted} from 0{' to below 1' if most == 1 else ' on'}")
-    return tuple(map(float, numbers)) if several else type(default)(value)
+        raise UsageError(f"{where} name is {chosen!r}; use one of {', '.join(kinds)}")
+    values = asdict(before) if kinds[chosen] is type(before) else {}
+    values |= {key: value for key, value in table.items() if key != "name"}
+    try:
+        kind = kinds[chosen]
+        kind.__pydantic_config__ = ConfigDict(strict=True, extra="forbid")
+        made = TypeAdapter(kind).validate_json(json.dumps(values))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise UsageError(f"{where} {first['loc'][0]}: {first['msg'].lower()}; see docs/training.md") from None
+    for key, value in asdict(made).items():
+        most = 1.0 if key in _BELOW_1 else math.inf
+        if not all(0 <= number < most for number in (value if isinstance(value, tuple) else (value,))):
+            raise UsageError(
+                f"{where} {key} is {value}; use numbers from 0{' to below 1' if most == 1 else ''}"
+            )
+    return made
 
 
 def write_config(folder: Path, options: Mapping[str, Any], training: TrainSettings, seed: int) -> None:
-    """Write DIR/config.toml: the options of the command line by name, and all other settings in force."""
-    tables = {"global": {"seed": seed}, "train": options}
+    """Write DIR/config.toml: the options of the command line by name, and the tables of `KINDS`.
+
+    TOML's strings, numbers and lists are JSON's; paths are made absolute.
+    """
+    tables: dict[str, Mapping[str, Any]] = {"global": {"seed": seed}, "train": options}
     for name in KINDS:
         group = getattr(training, name)
-        kind = {"name": type(group).__name__} if len(KINDS[name]) > 1 else {}
-        tables[f"train.{name}"] = kind | asdict(group)
-    text = "\n".join(
-        "".join([f"[{name}]\n", *(f"{key} = {_toml(value)}\n" for key, value in table.items())])
-        for name, table in tables.items()
-    )
+        tables[f"train.{name}"] = {"name": type(group).__name__, **asdict(group)}
+    lines = []
+    for name, table in tables.items():
+        lines.append(f"[{name}]")
+        for key, value in table.items():
+            lines.append(f"{key} = {json.dumps(str(value.absolute()) if isinstance(value, Path) else value)}")
     with atomic_path(folder / CONFIG) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-
-
-def _toml(value: Any) -> str:
-    """A value in TOML, whose strings, numbers and lists are JSON's; paths are made absolute."""
-    return json.dumps(str(value.absolute()) if isinstance(value, Path) else value)
+        temporary.write_text("\n".join([*lines, ""]), encoding="utf-8")

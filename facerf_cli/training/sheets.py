@@ -1,4 +1,4 @@
-"""Contact sheets of held-out people, scene-linear."""
+"""Draw contact sheets of held-out people, scene-linear."""
 
 from collections.abc import Iterable, Sequence
 
@@ -10,13 +10,13 @@ TRUE_COLOUR, FOUND_COLOUR = (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)  # of landmarks on 
 
 
 def tiled(rows: Iterable[Iterable[Tensor]]) -> np.ndarray:
-    """A contact sheet [H, W, 3] of rows of images [3, h, w]."""
+    """Join rows of images [3, h, w] into a contact sheet [H, W, 3]."""
     sheet: np.ndarray = torch.cat([torch.cat([*row], -1) for row in rows], -2).permute(1, 2, 0).cpu().numpy()
     return sheet
 
 
 def in_rows(cells: Sequence[Tensor], columns: int) -> list[Sequence[Tensor]]:
-    """Images in rows of so many, without a last one that is shorter."""
+    """Split images into rows of `columns`; a shorter last row is dropped."""
     rows = [cells[first : first + columns] for first in range(0, len(cells), columns)]
     return [row for row in rows if len(row) == len(rows[0])]
 

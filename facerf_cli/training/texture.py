@@ -1,8 +1,9 @@
-"""Stage `reflectance`: the Reflectance Network alone, on textures of synthetic heads or of a dataset.
+"""Stage `reflectance`: train only the Reflectance Network, on textures of synthetic heads or a dataset.
 
-With S_f the paper's feature loss on textures, L_L, is added to the default form's loss.
+With S_f, the paper's feature loss on textures, L_L, is added to the default form's loss.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,11 +11,20 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from facerf_cli.dataset.faces import DatasetFaces, SampleCrops
 from facerf_cli.errors import InputError
 from facerf_cli.network.checkpoint import new_network
 from facerf_cli.network.features import LightNetwork, feature_distance
-from facerf_cli.network.inputs import Batch, SourceColours, from_root, mean_colours, without_cast
+from facerf_cli.network.inputs import (
+    Batch,
+    SourceColours,
+    concatenate,
+    from_root,
+    mean_colours,
+    without_cast,
+)
 from facerf_cli.synth.bank.texture_samples import Sample, SampleSource
+from facerf_cli.training.build import Run
 from facerf_cli.training.losses import clipped_si_mse, root_loss
 from facerf_cli.training.objective import Objective, Validation, metrics_by_pose, seeded
 from facerf_cli.training.sheets import tiled
@@ -25,7 +35,7 @@ _SHEET_FACES = 5
 
 @dataclass(frozen=True)
 class HeadsSettings:
-    """Lights of a face and step, and held-out heads, each drawn `held_out_draws` times."""
+    """Lights per face and step, and held-out heads, each drawn `held_out_draws` times."""
 
     lights: int = 8
     held_out_heads: int = 12
@@ -33,10 +43,10 @@ class HeadsSettings:
 
 
 class HeadsObjective(Objective):
-    """A stage that trains one network on textures of heads."""
+    """Base of the stages that train one network on textures of heads."""
 
     def __init__(self, name: str, network: nn.Module, source: Any, settings: HeadsSettings) -> None:
-        """Train a network `name` on a `SampleSource`, or what has its heads and provenance."""
+        """Train a network `name` on a `SampleSource`, or another source of heads with provenance."""
         super().__init__({name: network}, source.provenance)
         self.source, self.settings = source, settings
         self.heads, self.held_out = source.heads(settings.held_out_heads)
@@ -52,6 +62,31 @@ class HeadsObjective(Objective):
         raise NotImplementedError
 
 
+class SamplesObjective(HeadsObjective):
+    """Base of the stages that train one network on sources and their targets under single lights."""
+
+    def draw(self, count: int, generator_of: Callable[..., torch.Generator], step: int) -> Any:
+        """Draw `count` samples; a dataset's samples share the stacks of their sources with other steps."""
+        if not isinstance(self.source, DatasetFaces):
+            return super().draw(count, generator_of, step)
+        drawn = []
+        for index in range(count):
+            head, crops = self.source.draw_shared(self.settings.lights, generator_of, index, step)
+            drawn.append(self.batch_of(crops, head, generator_of(index)))
+        return concatenate(drawn)
+
+    def draw_head(self, head: Tensor, generator: torch.Generator) -> Any:
+        return self.batch_of(self.source.draw(head, self.settings.lights, generator), head, generator)
+
+    def batch_of(self, sample: Sample | SampleCrops, head: Tensor, generator: torch.Generator) -> Any:
+        """Make the batch of a sample of a head [1]."""
+        raise NotImplementedError
+
+    def textures(self, sample: Sample | SampleCrops) -> Sample:
+        """Unwrap the crops of a dataset; samples of baked heads are textures already."""
+        return sample.unwrapped(self.source.side) if isinstance(sample, SampleCrops) else sample
+
+
 @dataclass(frozen=True)
 class TextureObjectiveSettings(HeadsSettings):
     """Settings of the stage `reflectance`."""
@@ -65,18 +100,18 @@ class TextureObjectiveSettings(HeadsSettings):
 class TextureBatch(Batch):
     """Samples and the indices of their heads [B]."""
 
-    sample: Sample
+    sample: Sample | SampleCrops
     heads: Tensor
 
 
-class TextureObjective(HeadsObjective):
+class TextureObjective(SamplesObjective):
     """`root_loss` of OLAT textures at the network's exposure; `light` is a frozen S_f."""
 
     chooses_by = "si_mse"
 
     def __init__(
         self,
-        source: SampleSource,
+        source: SampleSource | DatasetFaces,
         network: Any = None,
         light: LightNetwork | None = None,
         settings: TextureObjectiveSettings = TextureObjectiveSettings(),
@@ -86,31 +121,42 @@ class TextureObjective(HeadsObjective):
             try:
                 network.set_mean_face(*source.mean_face())
             except ValueError as error:
-                advice = "give another --bank or --start-from"
-                raise InputError(f"{error}, as the heads were baked; {advice}") from None
+                advice = "use another --bank or --start-from"
+                raise InputError(f"{error} when the heads were baked; {advice}") from None
         super().__init__("reflectance", network, source, settings)
         self.light = light
-        colours = []  # of sources of the training heads
+        self.source_colours = SourceColours.of(self._measure_colours())
+
+    def _measure_colours(self) -> Tensor:
+        """Measure mean colours [N, 3] of sources of the training heads."""
+        if isinstance(self.source, DatasetFaces):
+            return self.source.source_colours(_COLOURS_MEASURED, seeded(_COLOUR_SEED))
+        colours = []
         for index in range(_COLOURS_MEASURED):
             generator = seeded(_COLOUR_SEED, index)
             head = self.heads[torch.randint(len(self.heads), (1,), generator=generator)]
-            sample = source.draw(head, 1, generator)
+            sample = self.source.draw(head, 1, generator)
             colours.append(mean_colours(sample.source, sample.visible))
-        self.source_colours = SourceColours.of(torch.cat(colours))
+        return torch.cat(colours)
 
-    def draw_head(self, head: Tensor, generator: torch.Generator) -> TextureBatch:
-        return TextureBatch(self.source.draw(head, self.settings.lights, generator), head)
+    def batch_of(
+        self, sample: Sample | SampleCrops, head: Tensor, generator: torch.Generator
+    ) -> TextureBatch:
+        return TextureBatch(sample, head)
 
-    def draw_held_out(self, person: int, generator: torch.Generator) -> Sample:
-        return self.source.draw(torch.tensor([person]), self.settings.held_out_lights, generator)
+    def draw_held_out(self, person: int, generator: torch.Generator) -> Sample | SampleCrops:
+        drawn: Sample | SampleCrops = self.source.draw(
+            torch.tensor([person]), self.settings.held_out_lights, generator
+        )
+        return drawn
 
     def forward(self, batch: TextureBatch) -> dict[str, Tensor]:
         """Compute the term `root` and, with S_f, `light_features`, means over faces."""
-        network, sample = self.network, batch.sample
+        network, sample = self.network, self.textures(batch.sample)
         with self.mixed_precision():
             encoded = self._encoded(sample)
             root = network.decode_root(encoded, sample.normals_target, sample.lights).float()
-        # The network measures the exposure on seen texels alone, and divides by it.
+        # the network divides by the exposure that it measures on visible texels
         target = sample.target / encoded.exposure[:, None]
         terms = {"root": root_loss(root, target, sample.weight)}
         if self.light is not None:
@@ -125,16 +171,16 @@ class TextureObjective(HeadsObjective):
     def validate(self) -> Validation:
         """Measure the mean Si-MSE of held-out heads, clipped at white: of all, and by the target's pose.
 
-        The sheet has two rows a face: source and true OLATs; visible source and predicted OLATs.
+        The sheet has two rows per face: source and true OLATs; visible source and predicted OLATs.
         """
         errors: list[Tensor] = []
         same_pose: list[bool] = []
         rows: list[np.ndarray] = []
-        for sample in self.held_out_samples():
-            there = sample.to(self.device)
-            encoded = self._encoded(there)
-            predicted = self.network.decode(encoded, there.normals_target, there.lights).cpu()
-            errors.append(clipped_si_mse(predicted, sample.target, sample.weight).mean())
+        for held_out in self.held_out_samples():
+            sample = self.textures(held_out.to(self.device))
+            encoded = self._encoded(sample)
+            predicted = self.network.decode(encoded, sample.normals_target, sample.lights)
+            errors.append(clipped_si_mse(predicted, sample.target, sample.weight).mean().cpu())
             turned = (sample.normals_source - sample.normals_target).abs().max()
             same_pose.append(bool(turned < 1e-3))
             rows += [_sheet_rows(sample, predicted)] if len(rows) < _SHEET_FACES else []
@@ -146,7 +192,16 @@ class TextureObjective(HeadsObjective):
 
 
 def _sheet_rows(sample: Sample, predicted: Tensor) -> np.ndarray:
-    """Two rows of textures [2T, (L + 1) T, 3] of a sample's face."""
+    """Draw two rows of textures [2T, (L + 1) T, 3] of a sample's face."""
     mask = (sample.weight[0] > 0).float()
     truth = [sample.source[0], *(sample.target[0] * mask)]
     return tiled([truth, [sample.source[0] * sample.visible[0], *(predicted[0] * mask)]])
+
+
+def build(run: Run) -> Objective:
+    """Make the objective of the stage."""
+    side = run.texture_side
+    light, network = run.light_features(side), run.reflectance(side)
+    settings = TextureObjectiveSettings(held_out_heads=run.sizes.held_out_heads)
+    objective: Objective = run.objective(TextureObjective)(run.faces(), network, light, settings)
+    return objective

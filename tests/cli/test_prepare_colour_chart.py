@@ -98,7 +98,7 @@ def test_jobs_and_a_second_run(wrong: Path, corrected: Path, tmp_path: Path, cap
     corners = " ".join(f"{x + 1:g},{y:g}" for x, y in CORNERS)
     for line in ([], [*chart[:2], "--chart-corners", corners]):
         assert prepare(wrong, corrected, *SPLIT, *line) == 2
-        assert "other stage values; give --overwrite" in capsys.readouterr().err and tree(corrected) == before
+        assert "other stage values; pass --overwrite" in capsys.readouterr().err and tree(corrected) == before
 
 
 def test_an_older_charts_image_does_not_outlive_its_dataset_and_a_file_is_none(
@@ -117,12 +117,12 @@ def test_an_older_charts_image_does_not_outlive_its_dataset_and_a_file_is_none(
     ("line", "said"),
     [
         (["--colour-chart", "none.exr", *PLACE], "none.exr: no such file"),
-        (["--colour-chart", "chart.exr", "--chart-corners", "1,2 3,4 5,6"], "give four corners"),
-        (["--colour-chart", "chart.exr", "--chart-corners", "a,b c,d e,f g,h"], "give four corners"),
-        (["--colour-chart", "chart.exr", "--chart-corners", "1,2 3,4 5,6 nan,8"], "give four corners"),
+        (["--colour-chart", "chart.exr", "--chart-corners", "1,2 3,4 5,6"], "four corners in pixels"),
+        (["--colour-chart", "chart.exr", "--chart-corners", "a,b c,d e,f g,h"], "four corners in pixels"),
+        (["--colour-chart", "chart.exr", "--chart-corners", "1,2 3,4 5,6 nan,8"], "four corners in pixels"),
         (["--colour-chart", "chart.exr", "--chart-corners", "0,0 900,0 900,9 0,9"], "outside its 330 x 240"),
-        (["--colour-chart", "0000/C0/L000.exr"], "give the image and its chart's corners"),
-        (["--chart-corners", "1,2 3,4 5,6 7,8"], "give the image and its chart's corners"),
+        (["--colour-chart", "0000/C0/L000.exr"], "pass the image and its chart's corners"),
+        (["--chart-corners", "1,2 3,4 5,6 7,8"], "pass the image and its chart's corners"),
         (["--colour-chart", "{camera}.exr", *PLACE], "corners of 1 image, and --colour-chart names 3"),
     ],
 )

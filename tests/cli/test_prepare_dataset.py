@@ -80,7 +80,7 @@ def test_what_is_made_names_the_face_model_and_says_what_is_synthetic(
     sheet = (prepared.folder / "sheets" / "0000.jpg").read_bytes()
     assert b'facerf:face_model="builtin"' in sheet and b"facerf:face_model_licence" in sheet
     capture = replace(read_capture(given[0]), provenance={"synthetic": True})
-    how = Preparation(load_face_model(), SHIPPED_NETWORKS, DatasetFolder(given[0]), None, {})
+    how = Preparation(load_face_model(), SHIPPED_NETWORKS, DatasetFolder(folder=given[0]), None, {})
     made = _Subject(capture, "0000", (), how).provenance("C1")
     assert made["facerf:input"] == "0000/C1" and made["facerf:synthetic"] == 1
     assert made["IPTC:DigitalSourceType"] == COMPUTER_GRAPHICS_SOURCE_TYPE
@@ -270,7 +270,7 @@ def test_other_options_do_not_mix_and_a_dry_run_writes_nothing(
 ) -> None:
     line = ["prepare-dataset", str(given[0]), "-o", str(prepared.folder), "--crop", "128"]
     assert main(line) == 2
-    assert "was prepared otherwise: other crop; give --overwrite always" in capsys.readouterr().err
+    assert "other crop; pass --overwrite always" in capsys.readouterr().err
     assert prepare(given[0], tmp_path / "out", "--dry-run") == 0
     assert "olat/0001/C2.exr" in capsys.readouterr().out and not (tmp_path / "out").exists()
 
@@ -296,7 +296,7 @@ def test_a_new_split_says_that_old_pairs_are_of_another(
     assert "another split" not in capsys.readouterr().err
     assert prepare(given[0], out, "--split", "0/0/2") == 0
     said, relit = capsys.readouterr().err, out / "relit"
-    assert "pairs of 2 subjects are of another split" in said and "--overwrite" not in said
+    assert "pairs of 2 subjects belong to another split" in said and "--overwrite" not in said
     line = ["relight-dataset", str(out), "--envmaps", "procedural:2", "--per-subject", "1", "--lazy"]
     assert main(line) == 1 and "move the folder relit elsewhere" in capsys.readouterr().err
     relit.rename(tmp_path / "kept")  # the advice

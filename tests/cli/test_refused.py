@@ -143,13 +143,13 @@ WRONG: dict[str, dict[str, str]] = {
         "--split half": "--split",
         "--crop 97": "--crop",
         "--layout multipie": "there is extended-yale-b, faceolat, faceolat-linear, stage",
-        "--checks only --shard 1/2": "--shard: --checks only checks all subjects; omit it",
+        "--checks only --shard 1/2": "--shard: --checks only checks all subjects; use --jobs or --ray",
         "--pattern x": "--pattern requires --describe",
     },
     "prepare-dataset": {"one": "stage.json: no such file"},
     "relight-dataset data --per-subject 4": {
         "--envmaps empty": "empty: no inputs found (looked for .exr .hdr)",
-        "--envmaps procedural:999999999": "give at most 1000000",
+        "--envmaps procedural:999999999": "--envmaps: 999999999 maps ... 1000000",
         "--envmaps procedural:3 --memory inf": "--memory inf: not a size; pass a number",
         "--envmaps nowhere": "--envmaps nowhere: no such folder",
     },
@@ -172,10 +172,10 @@ WRONG: dict[str, dict[str, str]] = {
         "--preset paper --dataset data": "--vgg-weights imagenet ... --light-features FILE ... --crop 512",
         f"--checkpoint {SHIPPED['parsing']}": "holds a Parsing Network ... uses no network",
         f"--checkpoint {SHIPPED['portrait']}": "holds a Portrait Network ... uses the Parsing",
-        "--heads 13": "--heads 13: the mean face and 12 heads are held out; give more",
-        "--stage parsing --preset tiny --heads 4": "4 people are held out; give more",
+        "--heads 13": "--heads 13: the mean face and 12 heads are held out; use more",
+        "--stage parsing --preset tiny --heads 4": "4 people are held out; use more",
         **{
-            f"--max-time={time}": f"--max-time {time}: not a time; write a number and s, m or h, such as 45m"
+            f"--max-time={time}": f"--max-time {time}: not a time; use a number and s, m or h, such as 45m"
             for time in ("5", "-3m", "0s")
         },
     },
@@ -274,10 +274,10 @@ def test_a_line(
 
 
 CONFIGURATIONS = {
-    "[train.loss]\nphotometric = -9": "[train.loss] photometric is -9; give a number from 0 on",
-    "[train.optimizer]\nname = 'SGD'": "name is 'SGD'; give one of AdamW, Adadelta",
-    "[train.optimizer]\nbetas = [0.9]": "betas is [0.9]; give 2 numbers",
-    "[train]\nschedule = 3": "[train.schedule] is no table",
+    "[train.loss]\nphotometric = -9": "[train.loss] photometric is -9",
+    "[train.optimizer]\nname = 'SGD'": "name is 'SGD'; use one of AdamW, Adadelta",
+    "[train.optimizer]\nbetas = [0.9]": "[train.optimizer] betas",
+    "[train]\nschedule = 3": "[train.schedule] is not a table",
     "[relight]\nexpo = 1": "expo: no such command or option; see `facerf relight --help-all`",
     "[relighting]\n": "relighting: no such command or option; see `facerf --help-all`",
     "global = 3": "global is not a table; write [global]",

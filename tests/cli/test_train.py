@@ -21,8 +21,7 @@ from facerf_cli.portrait.parse import LANDMARKS
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth.bank.transport import seen_path
 from facerf_cli.training import run as training_run
-from facerf_cli.training.options import TrainOptions
-from facerf_cli.training.settings import Adadelta, Constant, PaperWeights
+from facerf_cli.training.settings import Adadelta, Constant, PaperWeights, TrainSettings
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.folders import rows
 from tests.kinds import Folders, Patch, Said
@@ -69,7 +68,7 @@ def test_the_configuration_of_a_run_repeats_it(run: Path, tmp_path: Path, capsys
     assert metadata["training"][-1]["optimizer"]["learning_rate"] == 0.5
     capsys.readouterr()
     assert main(["train", *config]) == 2
-    assert "give --resume" in capsys.readouterr().err
+    assert "pass --resume" in capsys.readouterr().err
 
 
 def test_a_configuration_reaches_loss_and_optimizer(tmp_path: Path, monkeypatch: Patch) -> None:
@@ -81,15 +80,15 @@ def test_a_configuration_reaches_loss_and_optimizer(tmp_path: Path, monkeypatch:
     (row,) = map(json.loads, (tmp_path / "run/log.jsonl").read_text().splitlines())
     assert row["terms"] == {"photometric": 0.0}
     assert "photometric = 0" in (tmp_path / "run/config.toml").read_text()
-    seen: list[TrainOptions] = []
-    monkeypatch.setattr(training_run, "run_training", seen.append)
+    seen: list[TrainSettings] = []
+    monkeypatch.setattr(training_run, "run_training", lambda options, training, typed: seen.append(training))
     (tmp_path / "c.toml").write_text(
         "[train]\nstage = 'joint'\ndataset = 'd'\nema-decay = 0\n[train.loss]\nfeatures = 0.1\n"
         "channels_apart = false\n"
         "[train.optimizer]\nname = 'Adadelta'\neps = 1e-6\n[train.schedule]\nname = 'Constant'\n"
     )
     assert main(["--config", str(tmp_path / "c.toml"), "train", "-o", str(tmp_path / "run")]) == 0
-    training = seen[0].training
+    (training,) = seen
     assert training.loss == PaperWeights(features=0.1, channels_apart=False) and training.ema_decay is None
     assert training.optimizer == Adadelta(eps=1e-6) and training.schedule == Constant()
 
@@ -133,7 +132,7 @@ def test_a_run_goes_on_by_the_command_and_is_not_written_over(
     assert steps_of(tmp_path / "run") == [1, 2, 3]
     capsys.readouterr()
     assert main([*line, "--steps", "3"]) == 2
-    assert "holds a run already; give --resume" in capsys.readouterr().err
+    assert "pass --resume" in capsys.readouterr().err
     assert main([*line, "--steps", "4", "--resume", "--mean-face"]) == 2
     assert "the run began with other data" in capsys.readouterr().err
 
@@ -178,7 +177,7 @@ def test_own_networks_and_losses_of_an_installed_package(
     assert "its network is my_lab.networks:Darker, code of your own; give --form" in capsys.readouterr().err
     assert main([*relight, *own]) == 0
     assert main([*line, "-o", str(tmp_path / "other"), "--objective", "my_lab.networks:Darker"]) == 2
-    assert "is no subclass of facerf_cli.training.texture:TextureObjective" in capsys.readouterr().err
+    assert "not a subclass of facerf_cli.training.texture:TextureObjective" in capsys.readouterr().err
 
 
 def test_the_mean_faces_fits_are_poses_and_its_runs_have_no_normals(run: Path, tmp_path: Path) -> None:
@@ -315,7 +314,7 @@ def test_feature_networks_of_another_scale_are_refused(tmp_path: Path, capsys: S
 def test_the_papers_form_trains_in_full_precision_by_default(
     line: tuple[str, ...], expected: bool, tmp_path: Path, monkeypatch: Patch
 ) -> None:
-    seen: list[TrainOptions] = []
-    monkeypatch.setattr(training_run, "run_training", seen.append)
+    seen: list[TrainSettings] = []
+    monkeypatch.setattr(training_run, "run_training", lambda options, training, typed: seen.append(training))
     assert main(["train", "-o", str(tmp_path / "run"), "--heads-from", "builtin", *line]) == 0
-    assert seen[0].training.bf16 is expected
+    assert seen[0].bf16 is expected

@@ -123,7 +123,7 @@ def _write_one(
     olats = skin * fragments.covered * cosine[:, None]  # [L, 3, H, W]
     weights = torch.from_numpy(constant_weights(directions.numpy()))
     source[:] = torch.einsum("l,lchw->hwc", weights, olats).numpy()
-    write_olat_stack(DatasetFolder(folder).stack_path(subject, camera), header, [olats])
-    path = DatasetFolder(folder).fit_path(subject, camera)
+    write_olat_stack(DatasetFolder(folder=folder).stack_path(subject, camera), header, [olats])
+    path = DatasetFolder(folder=folder).fit_path(subject, camera)
     path.parent.mkdir(parents=True, exist_ok=True)
     save_fit(path, fit)

@@ -1,8 +1,5 @@
-"""Crops of pairs and of photos: exposed, placed and moved as training needs them."""
+"""Crops of pairs: exposed, placed and moved as training needs them."""
 
-import json
-import logging
-import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,28 +10,22 @@ import torch
 
 from facerf_cli.dataset import crops as module
 from facerf_cli.dataset.crops import (
-    CACHED_SIDE_PX,
     UNMOVED,
     CropMove,
     PairReader,
     mean_translation_m,
     open_pairs,
-    open_photos,
     spread_pairs,
 )
 from facerf_cli.dataset.dataset import Dataset
-from facerf_cli.dataset.pairs import Pair, draw_pairs, image_path, load_pairs, relight_subject, write_pairs
+from facerf_cli.dataset.pairs import Pair, draw_pairs, load_pairs, write_pairs
 from facerf_cli.dataset.weights import envmap_names, relit_images
 from facerf_cli.errors import InputError
 from facerf_cli.face.fit import load_fit
-from facerf_cli.face.topology import LANDMARKS_M
-from facerf_cli.files.write import write_display
 from facerf_cli.network.inputs import MEAN_RADIANCE
-from facerf_cli.portrait.find import Face
-from facerf_cli.relighting.models import SHIPPED_NETWORKS, Networks
 from facerf_cli.synth.sky.skies import ProceduralMaps
 from tests.dataset.dataset_fixture import write_small_dataset
-from tests.kinds import Folders, Log, Patch
+from tests.kinds import Folders, Patch
 from tests.refusals import refused
 from tests.stacks import read_olat_stack
 
@@ -50,8 +41,6 @@ def dataset(tmp_path_factory: Folders) -> Dataset:
 def reader(dataset: Dataset) -> PairReader:
     maps = envmap_names(ProceduralMaps(3, 0, 32))
     write_pairs(dataset, draw_pairs(dataset, maps, 4, 0), overwrite=False)
-    for rows, weights in load_pairs(dataset).values():
-        relight_subject(dataset, rows, weights)
     return open_pairs(dataset, "train", CROP_PX)
 
 
@@ -65,7 +54,7 @@ def _face(dataset: Dataset, pair: Pair, camera: str) -> tuple[torch.Tensor, torc
 def test_pairs_are_the_datasets_images_exposed(dataset: Dataset, reader: PairReader) -> None:
     assert {pair.split for pair in reader.pairs} == {"train"} and len(reader.pairs) == 8
     for pair in reader.pairs[:3]:
-        found = reader.read(pair)
+        (found,) = reader.read([pair])
         weights = torch.from_numpy(np.array(load_pairs(dataset)[pair.subject][1][pair.index]))
         olats, seen, _ = _face(dataset, pair, pair.source_camera)
         source = torch.einsum("lc,lchw->chw", weights, olats)
@@ -80,19 +69,19 @@ def test_light_and_landmarks_follow_camera_and_crop(dataset: Dataset, reader: Pa
     """What it lights of a Lambertian face is what looks toward it."""
     for pair in reader.pairs:
         header = read_olat_stack(dataset.stack_path(pair.subject, pair.target_camera)).header
-        found = reader.read(pair)
+        (found,) = reader.read([pair])
         cosine = torch.from_numpy(header.normals) @ found.light[0]
         seen = torch.from_numpy(header.seen) > 0.5
         lit = found.target[0].mean(0) > 1e-4
         assert found.light.norm().item() == pytest.approx(1, abs=1e-5)
         assert (lit == (cosine > 0))[seen].float().mean() > 0.97
     pair = next(pair for pair in reader.pairs if pair.source_camera != pair.target_camera)
-    smaller = open_pairs(dataset, "train", CROP_PX // 2).read(pair)
+    (smaller,) = open_pairs(dataset, "train", CROP_PX // 2).read([pair])
     for name, camera in (("source", pair.source_camera), ("target", pair.target_camera)):
         expected = load_fit(dataset.fit_path(pair.subject, camera)).landmarks_px
         assert torch.allclose(getattr(smaller, f"{name}_landmarks_px")[0], expected / 2, atol=1e-3)
         assert getattr(smaller, name).shape == (1, 3, CROP_PX // 2, CROP_PX // 2)
-    same = reader.read(pair)
+    (same,) = reader.read([pair])
     assert torch.allclose(torch.nn.functional.avg_pool2d(same.target, 2), smaller.target, atol=1e-5)
 
 
@@ -108,7 +97,8 @@ def test_crops_are_never_enlarged_and_heads_stand_where_their_fits_say(dataset: 
 def test_a_drawn_crop_is_moved_with_its_landmarks(dataset: Dataset, reader: PairReader) -> None:
     """As far as a detector's box may be off; the content follows the landmarks."""
     pair, move = reader.pairs[0], CropMove(1.25, (0.1, -0.05))
-    plain, moved = reader.read(pair), reader.read(pair, (move, UNMOVED))
+    (plain,), (source,) = reader.read([pair]), reader._sum_sources([pair])
+    moved = reader._crop(pair, source.float(), move, UNMOVED)
     assert torch.equal(moved.target, plain.target)
     middle = torch.full((2,), CROP_PX / 2)
     wanted_px = (plain.source_landmarks_px - middle) * 1.25 + middle + CROP_PX * torch.tensor([0.1, -0.05])
@@ -133,19 +123,6 @@ def test_a_drawn_crop_is_moved_with_its_landmarks(dataset: Dataset, reader: Pair
     assert (spread / torch.tensor([0.1, 0.03]) - 0.9).abs().max() < 0.15  # normal, cut at two deviations
 
 
-def test_sources_that_were_not_written_are_weighed(
-    dataset: Dataset, reader: PairReader, monkeypatch: Patch
-) -> None:
-    pair = reader.pairs[5]
-    written = reader.read(pair)
-    path = image_path(dataset, *pair.key)
-    hidden = path.rename(path.with_suffix(".hidden"))
-    try:
-        assert torch.allclose(reader.read(pair).source, written.source, rtol=1e-3, atol=1e-4)
-    finally:
-        hidden.rename(path)
-
-
 def _generator_of(step: int, seed: int = 0) -> Callable[..., torch.Generator]:
     return lambda index, step=step: torch.Generator().manual_seed(hash((seed, step, index)))
 
@@ -161,25 +138,20 @@ def test_drawing_depends_on_the_generator_and_is_spread_over_subjects(reader: Pa
     assert spread_pairs(reader, 3, lambda pair: False) == []
 
 
-def test_a_stack_gives_the_lazy_sources_of_many_steps(
-    dataset: Dataset, reader: PairReader, monkeypatch: Patch
-) -> None:
+def test_a_stack_gives_the_sources_of_many_steps(reader: PairReader, monkeypatch: Patch) -> None:
     """They are those that reading gives, whatever the step that drawing begins at."""
     opened: list[Path] = []
     monkeypatch.setattr(
         module, "relit_images", lambda path, rows: opened.append(path) or relit_images(path, rows)
     )
-    monkeypatch.setattr(module, "image_path", lambda *key: Path("none"))
-    lazy = replace(reader)
-    module._lazy_sources.cache_clear()
-    drawn = [lazy.draw(1, _generator_of(step), step) for step in range(130)]
-    assert len(opened) <= 6  # 4 stacks for 32 steps each, and 2 more; one of a single pair is opened once
-    module._lazy_sources.cache_clear()
-    resumed = replace(reader).draw(1, _generator_of(70), 70)
-    assert torch.equal(resumed.source, drawn[70].source) and torch.equal(resumed.target, drawn[70].target)
-    sources = {float(batch.source.sum()) for batch in drawn}
-    assert len(sources) > 100  # each crop is moved in its own way, and there are many pairs
-    module._lazy_sources.cache_clear()
+    first, resumed = replace(reader), replace(reader)
+    drawn = [first.draw(1, _generator_of(step), step) for step in range(130)]
+    assert len(opened) <= 6  # 4 stacks for 32 steps each, and 2 more
+    again = resumed.draw(1, _generator_of(70), 70)
+    assert torch.equal(again.source, drawn[70].source) and torch.equal(again.target, drawn[70].target)
+    assert (
+        len({float(batch.source.sum()) for batch in drawn}) > 100
+    )  # of many pairs, each moved in its own way
 
 
 def test_the_only_person_is_validated_on_and_a_split_without_pairs_is_named(tmp_path: Path) -> None:
@@ -188,70 +160,3 @@ def test_the_only_person_is_validated_on_and_a_split_without_pairs_is_named(tmp_
     write_pairs(dataset, draw_pairs(dataset, envmap_names(ProceduralMaps(1, 0, 32)), 2, 0), overwrite=False)
     train, validation = (open_pairs(dataset, split, 32).pairs for split in ("train", "validation"))
     assert len(train) == 2 and validation == train
-
-
-SIDE_PX = 200
-
-
-def _landmarks_px(x: float) -> np.ndarray:
-    """A face whose nose is at x, as large as half the photo."""
-    return np.array([x, 100]) + LANDMARKS_M[:, :2] * [1, -1] * 500
-
-
-@pytest.fixture
-def looked_at() -> list[str]:
-    """What the detector was shown."""
-    return []
-
-
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: Patch, looked_at: list[str]) -> Path:
-    """Three photos; in the two darker ones there is a face."""
-
-    def find(_: object, pixels: np.ndarray, name: str) -> list[Face]:
-        looked_at.append(name)
-        if pixels.mean() > 0.7:
-            raise InputError(f"{name}: no face found")
-        return [Face((50, 50, 150, 150), 1.0, _landmarks_px(90 if pixels.mean() < 0.4 else 110))]
-
-    monkeypatch.setattr(module, "find_faces", find)
-    for name, value in (("a.png", 0.2), ("b.png", 0.6), ("c.png", 0.9)):
-        write_display(tmp_path / name, np.full((SIDE_PX, SIDE_PX, 3), value, np.float32))
-    return tmp_path
-
-
-def test_faces_are_found_once(folder: Path, looked_at: list[str], caplog: Log, monkeypatch: Patch) -> None:
-    paths, cache = sorted(folder.glob("*.png")), folder / "cache"
-    with caplog.at_level(logging.WARNING):
-        first = open_photos(paths, cache, SHIPPED_NETWORKS, 64)
-    assert [Path(name).name for name in looked_at] == ["a.png", "b.png", "c.png"]
-    assert caplog.text.count("c.png: no face found") == 1
-    again = open_photos(paths, cache, SHIPPED_NETWORKS, 64)
-    assert len(looked_at) == 3 and again.paths == first.paths and len(first.paths) == 2
-    os.utime(paths[0], (0, 0))
-    open_photos(paths, cache, SHIPPED_NETWORKS, 64)
-    assert len(looked_at) == 4  # the one that changed
-    monkeypatch.setattr(Networks, "sha256", lambda networks, name: "another")
-    open_photos(paths, cache, SHIPPED_NETWORKS, 64)
-    assert len(looked_at) == 7  # by another network
-
-
-def test_crops_hold_their_landmarks_and_no_face_at_all_is_an_error(folder: Path) -> None:
-    found = open_photos(sorted(folder.glob("*.png")), folder / "cache", SHIPPED_NETWORKS, 64)
-    drawn = found.draw(torch.Generator().manual_seed(0))
-    assert drawn.crops.shape == (1, 3, 64, 64) and drawn.landmarks_px.shape == (1, 68, 2)
-    full = found.landmarks_px / CACHED_SIDE_PX
-    move = CropMove.draw(_after_the_choice(0))  # as a detector's box would cut the crop
-    assert any(torch.allclose(drawn.landmarks_px[0] / 64, move.points(face), atol=1e-5) for face in full)
-    assert full.min() > 0 and full.max() < 1 and (full[:, :, 0].amax(1) - full[:, :, 0].amin(1)).min() > 0.4
-    records = [json.loads(path.read_text()) for path in (folder / "cache").glob("*.json")]
-    assert sum(record["landmarks_px"] is None for record in records) == 1
-    with pytest.raises(InputError, match="--photos: no face in any of 1 photos; give"):
-        open_photos([folder / "c.png"], folder / "cache", SHIPPED_NETWORKS, 64)
-
-
-def _after_the_choice(seed: int) -> torch.Generator:
-    """The generator of a draw once it has chosen one of two photos."""
-    generator = torch.Generator().manual_seed(seed)
-    torch.randint(2, (), generator=generator)
-    return generator

@@ -28,7 +28,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_dataset_is_read_as_it_was_written(small: Path) -> None:
     dataset = read_dataset(small)
     assert dataset.subjects == ("0000", "0001", "0002") and dataset.crop_px == 48
-    assert dataset.splits == {"train": ("0000",), "validation": ("0001",), "test": ("0002",)}
+    assert dataset.splits == {"train": ["0000"], "validation": ["0001"], "test": ["0002"]}
     assert dataset.split_of("0001") == "validation" and dataset.cameras["0002"] == ("C0", "C1")
     stack = read_olat_stack(dataset.stack_path("0001", "C1"))
     fit = load_fit(dataset.fit_path("0001", "C1"))

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from facerf_cli.dataset.dataset import Dataset
+from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.pairs import (
     draw_pair,
     draw_pairs,
@@ -54,7 +54,7 @@ def fresh(dataset: Dataset, tmp_path: Path) -> Dataset:
     """The same dataset without anything relit in it."""
     for part in ("olat", "fits", "dataset.json"):
         (tmp_path / part).symlink_to(dataset.folder / part)
-    return replace(dataset, folder=tmp_path)
+    return read_dataset(tmp_path)
 
 
 def write_map(path: Path, pixels: np.ndarray) -> str:
@@ -169,7 +169,7 @@ def test_the_vertical_is_found_whatever_the_capture_calls_it(
     dataset: Dataset, world_to_capture: np.ndarray
 ) -> None:
     """A capture whose y points down, or whose z points up, lights its faces from the same sky."""
-    tilted = replace(dataset, directions_world=dataset.directions_world @ world_to_capture.T)
+    tilted = dataset.model_copy(update={"directions_world": dataset.directions_world @ world_to_capture.T})
     np.testing.assert_allclose(world_to_map(tilted), world_to_capture.T, atol=1e-12)
     torch.testing.assert_close(map_directions(tilted), map_directions(dataset))
 
@@ -225,7 +225,9 @@ def test_parts_of_a_stack_and_a_stack_of_another_rig(dataset: Dataset) -> None:
     header = read_olat_header(path)
     np.testing.assert_array_equal(header.normals, stack.header.normals)
     np.testing.assert_array_equal(header.directions, stack.header.directions)
-    fewer = replace(dataset, directions_world=dataset.directions_world[:12], light_ids=dataset.light_ids[:12])
+    content = dataset.content() | {"folder": dataset.folder}
+    content["rig"]["lights"] = content["rig"]["lights"][:12]
+    fewer = Dataset.model_validate(content)
     refused(InputError, "20 lights, the dataset has 12", world_to_map, fewer)
     with pytest.raises(InputError, match="20 lights, the dataset has 12"):
         list(relit_images(dataset.stack_path("0000", "C0"), torch.ones(1, 12, 3)))

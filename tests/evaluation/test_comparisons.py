@@ -120,11 +120,16 @@ def test_lamberts_law_on_true_albedo_is_the_truth_in_any_pose(person: DatasetPer
     assert found.case.facts["map"] == "a"
 
 
+def with_traits(dataset: Dataset, traits: dict[str, Any]) -> Dataset:
+    entry = dataset.entries["0000"].model_copy(update={"traits": traits})
+    return dataset.model_copy(update={"entries": {"0000": entry}})
+
+
 def test_drift_of_the_tone_is_measured_where_the_skin_is_known(
     person: DatasetPerson, dataset: Dataset
 ) -> None:
     traits = {"ita_deg": 30.0, "melanin": 0.05, "haemoglobin": 0.02, "random_texture": False}
-    known = person_of(replace(dataset, traits={"0000": traits}))
+    known = person_of(with_traits(dataset, traits))
     front = int(known.header("C0").directions[:, 2].argmax())
     asked = [pair(0, "C0", "C0", front), pair(1, "C0", "C0", side_light(known, "C0"))]
     near, aside = olats(known, asked, [unlit()])
@@ -132,7 +137,7 @@ def test_drift_of_the_tone_is_measured_where_the_skin_is_known(
     assert abs(near.extra[LAMBERT]["tone_shift_deg"]) < 1  # it is the truth
     assert near.extra["unlit"]["tone_drift_deg"] == abs(near.extra["unlit"]["tone_shift_deg"])
     assert not aside.extra
-    painted = replace(dataset, traits={"0000": traits | {"random_texture": True}})
+    painted = with_traits(dataset, traits | {"random_texture": True})
     assert person_of(painted).facts == {"tone": "unknown"}
 
 
@@ -312,7 +317,7 @@ def test_a_case_is_the_stacks_image_and_facerf_renders_it_in_its_frame(
 
 
 def test_joint_fits_of_another_face_model_are_refused(person: DatasetPerson, dataset: Dataset) -> None:
-    other = DatasetPerson(replace(dataset, face_model="other"), "0000")
+    other = DatasetPerson(dataset.model_copy(update={"face_model": "other"}), "0000")
     refused(UsageError, "--face-model", list, other.compared(compare_olats, bench(person)))
 
 

@@ -1,6 +1,7 @@
 import torch
 
-from facerf_cli.light.sphere import rig_directions
+from facerf_cli.light.sh import rig_coefficients
+from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.network.diffuse_sh import DiffuseEstimate, DiffuseNetwork, DiffuseSettings
 from facerf_cli.synth.bank.heads import Bank
 from facerf_cli.synth.bank.texture_samples import Sample
@@ -53,7 +54,8 @@ def test_a_sample_depends_on_no_neighbour_and_the_source_teaches_the_light_alone
     stage = objective(bank)
     whole = stage.draw(3, lambda i: seeded(1, i), 0)
     part = stage.draw(1, lambda i: seeded(1, i + 2), 0)
-    assert torch.equal(whole.targets[2:], part.targets)
+    assert torch.equal(whole.sample.target[2:], part.sample.target)
+    assert torch.equal(whole.weights[2:], part.weights)
     assert torch.equal(whole.coefficients[2:], part.coefficients)
     terms = [stage(stage.draw(1, lambda i, k=k: seeded(1, k), 0)) for k in range(3)]
     for name, value in stage(whole).items():
@@ -72,10 +74,11 @@ def test_an_albedo_lit_by_lambert_in_a_dome_is_explained_exactly() -> None:
     weights = (
         (1 + rig @ torch.tensor([0.5, -0.2, 0.4])).view(1, -1, 1) * torch.tensor([1.0, 0.6, 0.3]) / len(rig)
     )
-    batch = sum_lights(sample, weights, torch.zeros(1))
-    estimate = DiffuseEstimate(albedo, batch.coefficients[:, 0], torch.ones(1, 1, 1, 1))
-    for image in predicted_images(estimate, batch):
-        assert torch.allclose(image, batch.targets, rtol=0.02, atol=1e-4)
+    summed = sum_lights(sample, weights[None])
+    coefficients = rig_coefficients(RigLight(rig, weights[0]), 2)[None]
+    estimate = DiffuseEstimate(albedo, coefficients, torch.ones(1, 1, 1, 1))
+    for image in predicted_images(estimate, summed, coefficients[None]):
+        assert torch.allclose(image, summed.target, rtol=0.02, atol=1e-4)
 
 
 def test_sums_are_of_one_power_and_from_uneven_to_even() -> None:

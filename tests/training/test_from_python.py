@@ -64,16 +64,16 @@ def test_a_dataset_holds_the_arrays_in_the_crop_of_the_face(page: dict[str, Any]
 @pytest.mark.parametrize(
     ("people", "directions", "said"),
     [
-        ({}, FRONT, "no name"),
-        ({"a/b": np.zeros((2, 8, 8, 3))}, FRONT, "'a/b' is no name"),
-        ({"a": np.zeros((2, 8, 8))}, FRONT, "give [2, height, width, 3]"),
-        ({"a": np.zeros((3, 8, 8, 3))}, FRONT, "shape [3, 8, 8, 3]"),
-        ({"a": np.zeros((2, 8, 8, 3))}, FRONT[0], "give [lights, 3]"),
-        ({"a": np.zeros((2, 8, 8, 3))}, 2 * FRONT, "give unit vectors"),
+        ({}, FRONT, "people"),
+        ({"a/b": np.zeros((2, 8, 8, 3))}, FRONT, "people[0] is 'a/b'; a name"),
+        ({"a": np.zeros((2, 8, 8))}, FRONT, "use [2, height, width, 3]"),
+        ({"a": np.zeros((3, 8, 8, 3))}, FRONT, "[3, 8, 8, 3]"),
+        ({"a": np.zeros((2, 8, 8, 3))}, FRONT[0], "directions[0]"),
+        ({"a": np.zeros((2, 8, 8, 3))}, 2 * FRONT, "directions[0] ... length 1"),
     ],
 )
 def test_arrays_that_do_not_fit(people: Any, directions: np.ndarray, said: str, tmp_path: Path) -> None:
-    refused(UsageError, said, write_dataset, tmp_path / "out", astronaut.models(), people, directions)
+    refused(InputError, said, write_dataset, tmp_path / "out", astronaut.models(), people, directions)
 
 
 def test_cameras_of_a_stage_and_a_mirrored_rig(tmp_path: Path) -> None:
@@ -91,7 +91,7 @@ def test_cameras_of_a_stage_and_a_mirrored_rig(tmp_path: Path) -> None:
     assert made.cameras == {"0000": ("C0", "C1", "C2")}
     with pytest.raises(InputError, match="0000/C0: rig: the lights are turned sideways"):
         write_dataset(tmp_path / "mirrored", models, {"0000": images}, rig * [-1, 1, 1], **given)
-    with pytest.raises(UsageError, match="one array for each of these"):
+    with pytest.raises(InputError, match="one per camera"):
         write_dataset(tmp_path / "one", models, {"0000": images["C0"]}, rig, **given)
 
 
@@ -103,7 +103,7 @@ def test_people_of_two_sizes_and_no_face(page: dict[str, Any], tmp_path: Path) -
     two = {"a": page["olats"], "b": page["olats"][:, 1:]}
     with pytest.raises(InputError, match=r"b: images of shape \[511, 512, 3\], not \[512, 512, 3\]"):
         write_dataset(tmp_path / "two", models, two, page["rig"], split="1/0/0")
-    refused(UsageError, "holds a dataset", write_dataset, page["folder"] / "dataset", models, one, FRONT)
+    refused(UsageError, "contains a dataset", write_dataset, page["folder"] / "dataset", models, one, FRONT)
     assert not (tmp_path / "two" / "dataset.json").exists()
 
 

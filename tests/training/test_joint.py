@@ -7,8 +7,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from facerf_cli.dataset.crops import CropPairs, PhotoCrops
+from facerf_cli.dataset.crops import CropPairs
 from facerf_cli.dataset.dataset import Dataset
+from facerf_cli.dataset.photos import PhotoCrops
 from facerf_cli.face.fit import fit_batch
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.network.features import LightNetwork, LightSettings, VggFeatures
@@ -51,7 +52,7 @@ class SmallGeometry(nn.Module):
 
 
 class FakePhotos:
-    """As `stage.photos.Photos`."""
+    """As `dataset.photos.Photos`."""
 
     paths = ("one",)
 
@@ -88,7 +89,7 @@ def batch_of(
 ) -> CropPairs | PhotoCrops:
     """A batch of the kind; `first` is its first sample's number."""
     step = next(s for s in range(99) if isinstance(objective.draw(1, seeded, s), PhotoCrops) == photos)
-    return objective.draw(count, lambda i: seeded(0, step, first + i), step)
+    return objective.draw(count, lambda i, step=step: seeded(0, step, first + i), step)
 
 
 def gradients(objective: JointObjective, term: Tensor) -> dict[str, float]:
@@ -205,7 +206,7 @@ def test_terms_of_a_known_head_are_small(dataset: Dataset) -> None:
     right = objective._geometry_terms(estimate, heads, detected_px)["landmarks"].sum()
     assert right < 0.02 < wrong
     images = torch.cat([batch.source, batch.target])
-    unwrapped = unwrap_images(images, heads, objective.camera, 96)
+    unwrapped = unwrap_images(images, heads, 96)
     rendered, mask = render_textures(unwrapped.texture, heads, objective.camera)
     difference = ((rendered - images).abs() * mask).sum() / mask.sum() / 3
     assert difference < 0.1 * (images * mask).sum() / mask.sum() / 3

@@ -12,8 +12,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from facerf_cli.dataset.crops import CropPairs, PhotoCrops, spread_pairs
+from facerf_cli.dataset.crops import CropPairs, spread_pairs
 from facerf_cli.dataset.dataset import Dataset
+from facerf_cli.dataset.photos import PhotoCrops
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import CONTOUR, INNER_MOUTH_CORNERS, grid_triangles
 from facerf_cli.network.geometry import GeometryEstimate
@@ -152,7 +153,7 @@ def _landmarks(asked: Asked, which: int) -> Tensor:
 
 def test_the_source_is_unwrapped_by_its_own_head_and_the_target_gives_normals_and_light(asked: Asked) -> None:
     texture, normals, visible = asked.network.encoded
-    face = unwrap_images(asked.batch.source, asked.head(SOURCE), CAMERA, SIDE)
+    face = unwrap_images(asked.batch.source, asked.head(SOURCE), SIDE)
     colours = asked.objective.source_colours
     assert colours is not None
     _close(texture, face.texture / colour_cast(face.texture, face.visible, colours))
@@ -171,7 +172,7 @@ def test_photometric_and_feature_terms_compare_the_target(asked: Asked) -> None:
     error = ((image - asked.batch.target).abs() * mask).sum() / 3 / mask.sum()
     _close(asked.terms["photometric"], 5 * error)
     # L_I is of I^_t and T^_t, L_L of T^_t alone; both against the target's own.
-    truth = unwrap_images(asked.batch.target, asked.head(TARGET), CAMERA, SIDE)
+    truth = unwrap_images(asked.batch.target, asked.head(TARGET), SIDE)
     seen = (truth.visible > 0).float()
     of_image = _raw_distance(asked, "appearance", image * mask, asked.batch.target * mask)
     of_texture = _raw_distance(asked, "light", asked.network.texture * seen, truth.texture * seen)
@@ -182,7 +183,7 @@ def test_photometric_and_feature_terms_compare_the_target(asked: Asked) -> None:
 def _raw_distance(asked: Asked, name: str, a: Tensor, b: Tensor) -> Tensor:
     """Mean squared differences of the layers, over their mean squares on training targets."""
     pairs = spread_pairs(asked.objective._train, 8, lambda pair: True)
-    targets = torch.cat([asked.objective._train.read(pair).target for pair in pairs])
+    targets = torch.cat([asked.objective._train.read_target(pair) for pair in pairs])
     powers = [layer.square().mean() for layer in Raw().layers(targets)]
     _close(asked.objective.features[name].powers, torch.stack(powers))
     layers = zip(Raw().layers(a), Raw().layers(b), powers, strict=True)
@@ -223,7 +224,7 @@ def test_a_strange_colour_of_light_is_removed_from_the_source_alone(dataset: Dat
     )
     found = _asked(dataset, cast)
     texture, _, visible = found.network.encoded
-    face = unwrap_images(cast.source, found.head(SOURCE), CAMERA, SIDE)
+    face = unwrap_images(cast.source, found.head(SOURCE), SIDE)
     mean, before = (((image * visible).sum((2, 3)) / visible.sum())[0] for image in (texture, face.texture))
     assert mean[2] / mean[1] < 0.5 * before[2] / before[1]
     assert isinstance(found.objective.source_colours, SourceColours)

@@ -144,7 +144,7 @@ def dies(function, at):
 
 def run(moment, folder):
     if moment == "save":
-        training.save_state = dies(training.save_state, 2)
+        training.Trainer._save_state = dies(training.Trainer._save_state, 2)
     elif moment == "state":
         end = dies(lambda: None, 2)
         def torn(content, path, save=torch.save):
@@ -219,7 +219,7 @@ def test_more_steps_go_on_from_a_finished_run(tmp_path: Path) -> None:
 
 def test_a_run_is_not_written_over_nor_resumed_otherwise(tmp_path: Path) -> None:
     train(toy_objective(), tmp_path, replace(TINY, steps=1))
-    refused(UsageError, "holds a run already; give --resume", train, toy_objective(), tmp_path, TINY)
+    refused(UsageError, "already contains a run; pass --resume", train, toy_objective(), tmp_path, TINY)
     with pytest.raises(UsageError, match="the run began otherwise: other batch; resume it"):
         train(toy_objective(), tmp_path, replace(TINY, batch=4), resume=True)
     (tmp_path / "state.pt").write_bytes((tmp_path / "state.pt").read_bytes()[:2000])
@@ -227,7 +227,7 @@ def test_a_run_is_not_written_over_nor_resumed_otherwise(tmp_path: Path) -> None
 
 
 def test_a_loss_that_is_not_finite_stops_with_the_batch_named(tmp_path: Path) -> None:
-    heads = [drawn.batch.heads.tolist() for drawn in first_draws(5)]
+    heads = [batch.heads.tolist() for _, batch, _ in first_draws(5)]
     poison = next(head for head in heads[4] if all(head not in before for before in heads[:4]))
     with pytest.raises(FacerfError) as caught:
         train(toy_objective(poison), tmp_path, replace(TINY, validate_every=2))

@@ -10,11 +10,8 @@ from facerf_cli.training.losses import (
     Features,
     MaskedPair,
     PaperWeights,
-    appearance_loss,
     clipped_si_mse,
-    closest_points,
     landmark_loss,
-    light_loss,
     photometric_loss,
     regularisation,
     root_loss,
@@ -80,23 +77,22 @@ def test_landmarks_are_in_half_sides(side_px: int) -> None:
 def test_the_contour_slides_to_the_closest_candidates_and_with_the_mesh() -> None:
     candidates = (torch.rand(2, 40, 2) * 100).requires_grad_()
     detected = (torch.rand(2, 17, 2) * 100).requires_grad_()
-    ids = closest_points(candidates, detected)
+    slid, closest = slid_contour(candidates, detected), set()
     for face in range(2):
         for number, point in enumerate(detected[face].tolist()):
             distances = [math.dist(point, other) for other in candidates[face].tolist()]
-            assert int(ids[face, number]) == distances.index(min(distances))
-    slid = slid_contour(candidates, detected)
-    assert torch.equal(slid, torch.stack([c[i] for c, i in zip(candidates, ids, strict=True)]))
+            closest.add((face, distances.index(min(distances))))
+            assert torch.equal(slid[face, number], candidates[face, distances.index(min(distances))])
     landmark_loss(slid, detected.detach(), 100).sum().backward()
     assert detected.grad is None  # which candidate it is has no gradient
     assert candidates.grad is not None
     moved = {(face, int(i)) for face, i, _ in candidates.grad.nonzero().tolist()}
-    assert moved == {(face, int(i)) for face in range(2) for i in ids[face]}
+    assert moved == closest
     # A landmark that the mesh passes by finds another vertex, not the one that it had.
     line = torch.stack([torch.arange(20.0), torch.zeros(20)], -1)[None]
     landmark = torch.tensor([[[7.2, 1.0]]])
-    assert closest_points(line, landmark).item() == 7
-    assert closest_points(line + torch.tensor([5.0, 0]), landmark).item() == 2
+    assert slid_contour(line, landmark)[0, 0, 0] == 7
+    assert slid_contour(line + torch.tensor([5.0, 0]), landmark)[0, 0, 0] == 7  # then vertex 2
 
 
 def test_photometric_loss_is_a_mean_over_the_mask() -> None:
@@ -137,9 +133,9 @@ def test_features_are_of_masked_images_and_their_powers_mean_squares(net: VggFea
         layers = zip(net.layers(one), net.layers(other), POWERS, strict=True)
         expected = expected + sum(((a - b) ** 2).mean((1, 2, 3)) / power for a, b, power in layers)
     features = Features(net, POWERS)
-    assert torch.allclose(appearance_loss(features, image, texture), expected, rtol=1e-4)
+    assert torch.allclose(image.distance(features) + texture.distance(features), expected, rtol=1e-4)
     masked = texture.prediction * texture.mask, texture.target * texture.mask
-    assert torch.allclose(light_loss(features, texture), feature_distance(net, *masked, POWERS))
+    assert torch.allclose(texture.distance(features), feature_distance(net, *masked, POWERS))
     ones = torch.ones(3)
     assert torch.allclose(feature_distance(net, *masked), feature_distance(net, *masked, ones))
     images = torch.rand(4, 3, 16, 16)
@@ -150,9 +146,8 @@ def test_features_are_of_masked_images_and_their_powers_mean_squares(net: VggFea
 def test_features_pull_the_prediction_within_the_mask_alone(net: VggFeatures) -> None:
     image, texture = _seen(24), _seen(16)
     target = texture.target.requires_grad_()
-    appearance_loss(
-        Features(net, POWERS), image, MaskedPair(texture.prediction, target, texture.mask)
-    ).sum().backward()
+    for pair in (image, MaskedPair(texture.prediction, target, texture.mask)):
+        pair.distance(Features(net, POWERS)).sum().backward()
     assert target.grad is None
     for seen in (image, texture):
         grad = seen.prediction.grad
@@ -169,7 +164,7 @@ def test_channels_apart_prefer_no_colour_and_stay_finite(net: VggFeatures) -> No
         factor[channel] = 0.7
         wrong = (skin * factor).requires_grad_()
         pair = MaskedPair(wrong, skin, torch.ones(2, 1, 24, 24))
-        (slope,) = torch.autograd.grad(light_loss(Features(net, POWERS, apart=True), pair).sum(), wrong)
+        (slope,) = torch.autograd.grad(pair.distance(Features(net, POWERS, apart=True)).sum(), wrong)
         pulls[channel] = -slope.sum((0, 2, 3))
     assert pulls[0, 0] > 0
     torch.testing.assert_close(pulls, pulls[0, 0] * torch.eye(3), rtol=1e-2, atol=0)
@@ -177,5 +172,5 @@ def test_channels_apart_prefer_no_colour_and_stay_finite(net: VggFeatures) -> No
         target = torch.tensor(colour)[:, None, None].expand(1, 3, 24, 24)
         wrong = torch.rand(1, 3, 24, 24).requires_grad_()
         pair = MaskedPair(wrong, target, torch.ones(1, 1, 24, 24))
-        light_loss(Features(net, POWERS, apart=True), pair).sum().backward()
+        pair.distance(Features(net, POWERS, apart=True)).sum().backward()
         assert wrong.grad is not None and wrong.grad.isfinite().all()

@@ -120,13 +120,34 @@ def simulate_camera(
         _greyed(x, grey) for x in (source * balance, target * balance[:, None], albedo * balance)
     )
     target = target * (MEAN_RADIANCE / _mean(albedo, visible))[:, None]
-    source = source / _mean(source, visible)
-    clip = uniform(1.6, 6.0)
-    sigma_texels = uniform(0, 1.2).view(-1, 1).expand(-1, 3).clamp_min(0.05)
-    source = scatter((source / clip).clamp(0, 1), sigma_texels) ** torch.exp(uniform(-0.22, 0.22))
-    noise = torch.randn(source.shape, generator=generator) * uniform(0, 0.02)
-    source = (source + noise * (source + 0.02).sqrt()).clamp(0, 1)
-    return source / _mean(source, visible) * MEAN_RADIANCE, target
+    return CameraResponse.draw(faces, source.shape[-1], generator).apply(source, visible), target
+
+
+@dataclass(frozen=True)
+class CameraResponse(Batch):
+    """Clipping, blur, tone curve and noise of the cameras of B faces; [B, 1, 1, 1] but for the noise."""
+
+    clip: Tensor
+    sigma_texels: Tensor
+    gamma: Tensor
+    noise: Tensor  # [B, 3, T, T]
+
+    @staticmethod
+    def draw(faces: int, side: int, generator: torch.Generator) -> "CameraResponse":
+        """Draw the cameras of textures of a side."""
+        uniform = Uniform(generator, (faces, 1, 1, 1))
+        clip, sigma_texels = uniform(1.6, 6.0), uniform(0, 1.2)
+        gamma = torch.exp(uniform(-0.22, 0.22))
+        noise = torch.randn(faces, 3, side, side, generator=generator) * uniform(0, 0.02)
+        return CameraResponse(clip, sigma_texels, gamma, noise)
+
+    def apply(self, source: Tensor, visible: Tensor) -> Tensor:
+        """Photograph sources [B, 3, T, T], exposed to a mean of `MEAN_RADIANCE`."""
+        source = source / _mean(source, visible)
+        sigma_texels = self.sigma_texels.view(-1, 1).expand(-1, 3).clamp_min(0.05)
+        source = scatter((source / self.clip).clamp(0, 1), sigma_texels) ** self.gamma
+        source = (source + self.noise * (source + 0.02).sqrt()).clamp(0, 1)
+        return source / _mean(source, visible) * MEAN_RADIANCE
 
 
 def camera_matrix(generator: torch.Generator) -> Tensor:

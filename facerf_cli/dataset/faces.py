@@ -1,0 +1,257 @@
+"""Faces of a prepared dataset for the stages that train on textures, unwrapped in the training step.
+
+Workers read crops from the OLAT stacks (`dataset/crops.py`); the device unwraps them, and no textures are
+written. Samples replace the synthetic ones of `synth/bank/texture_samples.py`.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from facerf_cli.dataset.crops import PairReader, StackInfo, pairs_of_split, stack_info, unwrap_crops
+from facerf_cli.dataset.dataset import Dataset, people_of, provenance_of, read_dataset
+from facerf_cli.dataset.pairs import Pair, load_pairs
+from facerf_cli.errors import InputError
+from facerf_cli.face.morphable import MorphableModel, load_face_model
+from facerf_cli.face.topology import grid_triangles, on_device
+from facerf_cli.files.olat_stack import read_olats
+from facerf_cli.light.sphere import RIG_LIGHTS
+from facerf_cli.light.transport import BakeSettings
+from facerf_cli.network.inputs import MEAN_RADIANCE, Batch, resize
+from facerf_cli.raster.texture import inpaint, normal_map
+from facerf_cli.synth.bank.heads import HeadBakeSettings, bake_head
+from facerf_cli.synth.bank.texture_samples import CameraResponse, Sample, camera_matrix, draw_target_lights
+
+_LEAST_INSIDE = 0.9  # fraction of a texel's pixels that must lie on the face and inside the photo
+_AROUND_PX = 16  # rows read beyond the face, for texels that cross its border
+_CROP_PER_TEXTURE = 2  # largest side of a crop that is unwrapped, in sides of the texture
+_MEAN_SIDE = 64  # texels along a side of the mean face's shadows
+
+
+@dataclass(frozen=True)
+class FaceCrops(Batch):
+    """N images of each of B faces, in crops of side S.
+
+    Attributes:
+        images: [B, N, 3, S, S], linear.
+        seen: [B, 1, S, S] in 0..1, where the crop shows the face.
+        vertices: [B, V, 3], fitted meshes in camera space.
+    """
+
+    images: Tensor
+    seen: Tensor
+    vertices: Tensor
+
+    def unwrapped(self, side: int) -> tuple[Tensor, Tensor]:
+        """Return textures [B, N, 3, T, T], 0 where unseen, and visibility [B, 1, T, T].
+
+        A texel is unseen if too few of its pixels lie on the face.
+        """
+        planes = torch.cat([self.images.flatten(1, 2).float(), self.seen], 1)
+        textures, visible = unwrap_crops(planes, self.vertices, side)
+        inside = textures[:, -1:] > _LEAST_INSIDE
+        textures = (textures[:, :-1] * inside).view(*self.images.shape[:3], side, side)
+        return textures, visible[:, None] * inside
+
+
+@dataclass(frozen=True)
+class LightTextures(Batch):
+    """B faces under L single lights: textures [B, L, 3, T, T] linear, zero where unseen; lights [B, L, 3].
+
+    The lights are unit vectors in the head's frame; `heads` [B] are the heads' indices.
+    """
+
+    textures: Tensor
+    lights_head: Tensor
+    heads: Tensor
+
+
+@dataclass(frozen=True)
+class LitCrops(Batch):
+    """B faces under L single lights; `colours` [B, 3, 3] map true colours to an exposed camera's."""
+
+    crops: FaceCrops
+    colours: Tensor
+    lights_head: Tensor
+    heads: Tensor
+
+    def unwrapped(self, side: int) -> LightTextures:
+        """Unwrap the faces to textures of a side."""
+        textures, _ = self.crops.unwrapped(side)
+        return LightTextures(_coloured(textures, self.colours), self.lights_head, self.heads)
+
+
+@dataclass(frozen=True)
+class SampleCrops(Batch):
+    """Crops of a `Sample`: B sources, and their targets under L lights each.
+
+    Attributes:
+        source: One image of each face.
+        target: L images of each face, by the target's camera.
+        turn: [B, 3, 3], from the source's camera space to the target's.
+        lights: [B, L, 3], unit vectors in the target's camera space.
+        colours: [B, 3, 3], from true colours to an exposed camera's.
+        response: The cameras of the sources.
+    """
+
+    source: FaceCrops
+    target: FaceCrops
+    turn: Tensor
+    lights: Tensor
+    colours: Tensor
+    response: CameraResponse
+
+    def unwrapped(self, side: int) -> Sample:
+        """Unwrap the faces to textures of a side, with the sources as their cameras would see them."""
+        source, visible = self.source.unwrapped(side)
+        target, target_visible = self.target.unwrapped(side)
+        photo = self.response.apply(_coloured(source, self.colours)[:, 0], visible)
+        normals = normal_map(self.source.vertices, on_device(photo.device, grid_triangles), side)
+        return Sample(
+            source=inpaint(photo, visible[:, 0]),
+            visible=visible,
+            normals_source=normals,
+            # the source's normals, rotated, like in `Field.olats`
+            normals_target=torch.einsum("bdc,bcij->bdij", self.turn, normals),
+            lights=self.lights,
+            target=_coloured(target, self.colours),
+            weight=target_visible * (0.3 + 0.7 * visible),
+        )
+
+
+def _coloured(textures: Tensor, matrices: Tensor) -> Tensor:
+    """Apply matrices [B, 3, 3] to the colours of textures [B, N, 3, T, T]."""
+    return (matrices[:, None] @ textures.flatten(3)).view(textures.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class DatasetFaces:
+    """Faces of a prepared dataset, for textures of `side` texels; heads are indices of `dataset.subjects`."""
+
+    dataset: Dataset
+    model: MorphableModel
+    side: int
+    crop_px: int  # side of the crops that are unwrapped
+    train: PairReader  # of the split train
+    fewest_lights: int  # that a subject has
+    rig_lights: int  # of the mean face's shadows
+    provenance: dict[str, Any]
+
+    def heads(self, held_out: int) -> tuple[Tensor, Tensor]:
+        """Return heads of the split train, and at most `held_out` of the split validation."""
+        train, validation = (
+            torch.tensor([self.dataset.subjects.index(subject) for subject in people_of(self.dataset, split)])
+            for split in ("train", "validation")
+        )
+        return train, validation[:held_out]
+
+    def mean_face(self) -> tuple[Tensor, Tensor, Tensor]:
+        """See `mean_face_of`."""
+        return mean_face_of(self.model, self.rig_lights)
+
+    def source_colours(self, count: int, generator: torch.Generator) -> Tensor:
+        """Measure mean colours [N, 3] of about `count` training sources, as random cameras see them."""
+        colours = self.train.source_colours(count)
+        return torch.stack([camera_matrix(generator) @ colour for colour in colours]).double()
+
+    def draw_shared(
+        self, lights: int, generator_of: Callable[..., torch.Generator], index: int, step: int
+    ) -> tuple[Tensor, SampleCrops]:
+        """Draw a training sample with `lights` target lights, and its head [1].
+
+        See `PairReader.draw_source`.
+        """
+        pair, source = self.train.draw_source(generator_of, index, step)
+        head = torch.tensor([self.dataset.subjects.index(pair.subject)])
+        return head, self._sample(pair, source, lights, generator_of(index))
+
+    def draw(self, head: Tensor, lights: int, generator: torch.Generator) -> SampleCrops:
+        """Draw a sample of a head [1]; its stack is opened for this sample only."""
+        subject = self.dataset.subjects[int(head)]
+        pairs = load_pairs(self.dataset).get(subject, ([],))[0]
+        reader = PairReader(self.dataset, (subject,), pairs, self.crop_px)
+        seed = int(torch.randint(1 << 31, (), generator=generator))
+        pair, source = reader.draw_sources(seed)[0]
+        return self._sample(pair, source.float(), lights, generator)
+
+    def _sample(self, pair: Pair, source: Tensor, lights: int, generator: torch.Generator) -> SampleCrops:
+        """Add target lights, the pair's first, and a camera to a source [3, H, W].
+
+        The albedo of real skin is unknown. The face under a constant map of radiance 1 gives the exposure
+        instead; it equals the albedo except for light that other parts of the face occlude.
+        """
+        path = self.dataset.stack_path(pair.subject, pair.target_camera)
+        source_info, info = (
+            stack_info(self.dataset.stack_path(pair.subject, pair.source_camera)),
+            stack_info(path),
+        )
+        chosen = draw_target_lights(info.directions, min(lights, self.fewest_lights), generator)
+        chosen = torch.cat([torch.tensor([pair.target_light]), chosen[chosen != pair.target_light]])
+        chosen = chosen[: min(lights, self.fewest_lights)]
+        colours = camera_matrix(generator)
+        exposure = MEAN_RADIANCE / (colours @ source_info.lit_colour).mean()
+        return SampleCrops(
+            source=self._crops(source_info, source[None]),
+            target=self._crops(info, _read_face(path, info, chosen.tolist())),
+            turn=(info.rotation @ source_info.rotation.T)[None],
+            lights=info.directions[chosen][None],
+            colours=(exposure * colours)[None],
+            response=CameraResponse.draw(1, self.side, generator),
+        )
+
+    def draw_lights(self, head: Tensor, lights: int, generator: torch.Generator) -> LitCrops:
+        """Draw a head [1] under random lights of one of its cameras, by a camera of random colours."""
+        subject = self.dataset.subjects[int(head)]
+        cameras = self.dataset.cameras[subject]
+        camera = cameras[int(torch.randint(len(cameras), (), generator=generator))]
+        path = self.dataset.stack_path(subject, camera)
+        info = stack_info(path)
+        chosen = draw_target_lights(info.directions, min(lights, self.fewest_lights), generator).tolist()
+        crops = self._crops(info, _read_face(path, info, chosen))
+        colours = camera_matrix(generator) * (MEAN_RADIANCE / info.lit_mean)
+        directions = info.directions[chosen] @ info.rotation  # R^T w, of row vectors
+        return LitCrops(crops, colours[None], directions[None], head)
+
+    def _crops(self, info: StackInfo, images: Tensor) -> FaceCrops:
+        """Resample images [N, 3, H, W] of a stack to the side that is unwrapped."""
+        if info.side_px != self.crop_px:
+            images = resize(images.float(), self.crop_px)
+        seen = resize(info.face[None, None].float(), self.crop_px)
+        return FaceCrops(images[None], seen, info.fit.vertices_camera(self.model)[None])
+
+
+def _read_face(path: Path, info: StackInfo, lights: Sequence[int]) -> Tensor:
+    """Read OLATs [N, 3, H, W] float16 of a stack, 0 above and below the face."""
+    rows = info.face.any(1).nonzero()[:, 0]
+    part = slice(max(int(rows[0]) - _AROUND_PX, 0), int(rows[-1]) + 1 + _AROUND_PX)
+    images = torch.zeros(len(lights), 3, *info.face.shape, dtype=torch.float16)
+    images[:, :, part] = read_olats(path, lights, part)
+    return images
+
+
+def mean_face_of(model: MorphableModel, rig_lights: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Bake a face model's mean: normals [3, T, T], visibility [L, T, T] and light directions [L, 3]."""
+    settings = HeadBakeSettings(_MEAN_SIDE, rig_lights, bake=BakeSettings(bounce_samples=0))
+    mean = bake_head(model, 0, 0, settings)
+    normals = normal_map(mean["vertices"], grid_triangles(), _MEAN_SIDE)
+    return normals, mean["visibility"].float() / 255, mean["directions"]
+
+
+def open_faces(folder: Path, face_model: str, side: int, rig_lights: int = RIG_LIGHTS) -> DatasetFaces:
+    """Open the dataset in a folder for training on textures of `side` texels.
+
+    Raises InputError if it was fitted with another face model.
+    """
+    dataset, model = read_dataset(folder), load_face_model(face_model)
+    if model.name != dataset.face_model:
+        fitted = f"fitted with the face model {dataset.face_model}, not {model.name}"
+        raise InputError(f"{dataset.folder}: {fitted}; pass {dataset.face_model} to --fit-with")
+    crop_px = min(dataset.crop_px, _CROP_PER_TEXTURE * side)
+    train = pairs_of_split(dataset, "train", crop_px)
+    lights = min(len(dataset.lights_of(subject)) for subject in dataset.subjects)
+    provenance = provenance_of(dataset, model)
+    return DatasetFaces(dataset, model, side, crop_px, train, lights, rig_lights, provenance)
