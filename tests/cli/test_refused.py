@@ -169,9 +169,9 @@ WRONG: dict[str, dict[str, str]] = {
         "--stage joint --dataset d --fit-with m.npz": "--fit-with: ... add --geometry landmarks",
         "--geometry landmarks": "--geometry: does not apply to the stage reflectance",
         "--preset paper --dataset d --vgg-weights v --appearance-features a": "use one of them",
-        "--preset paper --dataset data": "--vgg-weights imagenet ... --light-features FILE ... --crop 512",
+        "--preset paper --dataset data": "--vgg-weights imagenet ... --light-features FILE",
         f"--checkpoint {SHIPPED['parsing']}": "holds a Parsing Network ... uses no network",
-        f"--checkpoint {SHIPPED['portrait']}": "holds a Portrait Network ... uses the Parsing",
+        f"--checkpoint {SHIPPED['portrait']}": "holds a Portrait Network ... uses no network",
         "--heads 13": "--heads 13: the mean face and 12 heads are held out; use more",
         "--stage parsing --preset tiny --heads 4": "4 people are held out; use more",
         **{
