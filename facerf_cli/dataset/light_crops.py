@@ -23,7 +23,7 @@ from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.network.inputs import MEAN_RADIANCE, Batch
 from facerf_cli.raster.camera import crop_camera
 from facerf_cli.raster.texture import UnwrapSettings, unwrap
-from facerf_cli.synth.bank.texture_samples import camera_matrix, draw_target_lights
+from facerf_cli.synth.bank.texture_samples import CAMERA, draw_target_lights
 
 _FACES_KEPT = 512  # a worker, of .7 MB at 512 pixels
 _AROUND_PX = 16  # rows read beyond the face, for texels that cross its border
@@ -89,7 +89,7 @@ class LightStacks:
         face = _face_of(path, self.model)
         chosen = draw_target_lights(face.directions, min(lights, len(face.directions)), generator).tolist()
         directions = face.directions[chosen] @ face.rotation  # R^T w, of row vectors
-        seen, colours = face.seen[None, None].float(), face.exposure * camera_matrix(generator)
+        seen, colours = face.seen[None, None].float(), face.exposure * CAMERA.colours(generator)
         images = torch.zeros(1, len(chosen), 3, *face.seen.shape, dtype=torch.float16)
         images[0, ..., face.rows, :] = read_olats(path, chosen, face.rows)
         return LightCrops(images, colours[None], seen, face.vertices[None], directions[None], head)

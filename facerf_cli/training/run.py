@@ -169,7 +169,7 @@ class _TrainedStage:
         provenance = self._bake()
         images = folder / "pictures"
         add_head_images(folder / "heads", images, sizes.images, options.jobs, options.settings.seed)
-        faces = RenderedFaces(images, provenance)
+        faces = RenderedFaces(images, self._backgrounds(folder), provenance)
         network = self.make.geometry(faces.mean_translation_m())
         settings = GeometryObjectiveSettings(held_out_heads=sizes.held_out_heads)
         return self._kind(GeometryObjective)(faces, network, settings)

@@ -15,6 +15,7 @@ from facerf_cli.synth.bank.face_crops import RenderedFaces, add_head_images
 from facerf_cli.training.geometry import GeometryObjective, GeometryObjectiveSettings
 from facerf_cli.training.objective import seeded
 from tests.refusals import refused
+from tests.synth.conftest import backgrounds
 
 FEW = GeometryObjectiveSettings(held_out_heads=1, held_out_draws=4)
 
@@ -32,7 +33,7 @@ def images(bank_folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def faces(images: Path) -> RenderedFaces:
-    return RenderedFaces(images, {"licence": "MIT"})
+    return RenderedFaces(images, backgrounds(), {"licence": "MIT"})
 
 
 @pytest.fixture
@@ -113,5 +114,5 @@ def test_validation_is_the_same_every_time_and_shows_it(objective):
 
 
 def test_no_images_is_said(tmp_path):
-    refused(InputError, "no images of heads", RenderedFaces, tmp_path, {})
+    refused(InputError, "no images of heads", RenderedFaces, tmp_path, backgrounds(), {})
     refused(InputError, "no baked heads", add_head_images, tmp_path, tmp_path / "out", 1, 1, 0)

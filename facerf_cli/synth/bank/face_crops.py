@@ -23,14 +23,15 @@ from facerf_cli.face.fit import fit_batch
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import GRID, MIRROR_68, grid_uv
 from facerf_cli.network.inputs import Batch
-from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, Camera, crop_camera, project
+from facerf_cli.raster.camera import Camera, crop_camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
-from facerf_cli.raster.texture import sample_texture, texel_centres_uv
+from facerf_cli.raster.texture import sample_texture
 from facerf_cli.synth.appearance.people import hair_albedo
 from facerf_cli.synth.appearance.skin import draw_skin
 from facerf_cli.synth.bank import Files, file_of, files_in, fill, split_heads
 from facerf_cli.synth.bank.heads import HeadPhoto, ViewSettings, landmarks_of, photograph_head
 from facerf_cli.synth.bank.texture_samples import HeadFields, draw_light, head_fields
+from facerf_cli.synth.camera import Similarity, SimulatedCamera, background, occluder, recoloured, resample
 from facerf_cli.synth.head.body import draw_body
 from facerf_cli.synth.head.glasses import draw_glasses
 from facerf_cli.synth.head.hair import draw_hair
@@ -231,8 +232,9 @@ def _harmonics(directions: Tensor) -> Tensor:
 
 
 _IMAGES = ImageSettings()
-_FACE_DEPTH_M = 0.11  # distance from the face back to the origin of the head frame
-_OCCLUDED, _GREY, _TURNED = 0.3, 0.25, 0.5  # shares of samples that are occluded, grey, rotated
+_OCCLUDED, _TURNED = 0.3, 0.5  # fractions of samples
+_NEAREST_OCCLUDER = 0.3  # distance from the crop's middle, in sides
+_CAMERA = SimulatedCamera(0.2, curve=0.3)
 _TURN_DEG = 15.0  # largest turn
 # Standard deviations of the shift to the right and down (sides) and of log scale: a crop is cut around a
 # detector's box, see `dataset/crops.py`.
@@ -254,9 +256,15 @@ class FaceCrops(Batch):
 class RenderedFaces:
     """Images of the bank's heads, held in memory as bytes, from which crops are drawn."""
 
-    def __init__(self, folder: Path, provenance: dict[str, Any], settings: ImageSettings = _IMAGES) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        backgrounds: Tensor,
+        provenance: dict[str, Any],
+        settings: ImageSettings = _IMAGES,
+    ) -> None:
         paths = files_in(folder, "no images of heads; make them with `facerf train --stage geometry`")
-        self.provenance = provenance
+        self.backgrounds, self.provenance = backgrounds, provenance
         self.settings = settings
         self.images = [load_file(path) for path in paths]
 
@@ -276,12 +284,17 @@ class RenderedFaces:
         stored = {name: tensor[index] for name, tensor in images.items()}
         if torch.rand((), generator=generator) < 0.5:
             stored = _mirrored(stored, self.settings.crop_px)
-        move = _Move.draw(generator)
-        crop = move.image(stored["pictures"], side, self.settings)
-        rotation, translation_m = move.pose(stored["rotation"], stored["translation_m"])
+        crop_px, margin_px = self.settings.crop_px, self.settings.margin_px
+        centre_px = torch.full((2,), crop_px / 2)
+        crop = _draw_crop(centre_px, crop_px, generator)
+        pixels = stored["pictures"].float() / 255
+        pixels[:3] *= pixels[:3]
+        person = resample(pixels, crop.positions_px(side) + margin_px, "zeros")
+        image = recoloured(_composed(person, self.backgrounds, generator), _CAMERA.colours(generator))
+        rotation, translation_m = crop.pose(centre_px, crop_px, stored["rotation"], stored["translation_m"])
         return FaceCrops(
-            _with_camera_errors(_composed(crop, generator), generator)[None],
-            side * move.points(stored["landmarks_px"] / self.settings.crop_px)[None],
+            _CAMERA.take(image, image.mean(), generator)[None],
+            side * crop.in_crop(stored["landmarks_px"])[None],
             rotation[None],
             translation_m[None],
             stored["alpha"][None],
@@ -316,111 +329,20 @@ def _mirrored_coefficients() -> tuple[Tensor, Tensor]:
     return maps[0], maps[1]
 
 
-@dataclass(frozen=True)
-class _Move:
-    """A similarity of the crop: rotation and scale about its centre, then a shift in units of its side."""
-
-    angle: float  # radians, counter-clockwise on screen
-    scale: float
-    shift: Tensor  # [2] right and down
-
-    @staticmethod
-    def draw(generator: torch.Generator) -> "_Move":
-        """Draw a random move."""
-        turned = bool(torch.rand((), generator=generator) < _TURNED)
-        angle = math.radians(_TURN_DEG) * (2 * float(torch.rand((), generator=generator)) - 1) * turned
-        scale = math.exp(_SCALE * float(torch.randn((), generator=generator).clamp(-2, 2)))
-        shift = torch.tensor(_SHIFT) * torch.randn(2, generator=generator).clamp(-2, 2)
-        return _Move(angle, scale, shift)
-
-    def _matrix(self) -> Tensor:
-        """Rotation and scale [2, 2] of (right, down)."""
-        cos, sin = math.cos(self.angle), math.sin(self.angle)
-        return self.scale * torch.tensor([[cos, sin], [-sin, cos]])
-
-    def points(self, share: Tensor) -> Tensor:
-        """Move points [N, 2], in units of the crop's side."""
-        return (share - 0.5) @ self._matrix().T + 0.5 + self.shift
-
-    def image(self, stored: Tensor, side: int, settings: ImageSettings) -> Tensor:
-        """Resample a stored image [4, P, P] to a crop [4, side, side] of linear colour and cover."""
-        away = texel_centres_uv(side) - 0.5 - self.shift
-        source = away @ torch.linalg.inv(self._matrix()).T + 0.5
-        whole_px = settings.crop_px + 2 * settings.margin_px
-        grid = 2 * (source * settings.crop_px + settings.margin_px) / whole_px - 1
-        linear = stored.float() / 255
-        linear[:3] *= linear[:3]
-        return F.grid_sample(linear[None], grid[None], align_corners=False)[0]
-
-    def pose(self, rotation: Tensor, translation_m: Tensor) -> tuple[Tensor, Tensor]:
-        """Move the pose with the crop; shift and scale are exact at the depth of the face."""
-        cos, sin = math.cos(self.angle), math.sin(self.angle)
-        turn = torch.tensor([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]])
-        turned = turn @ translation_m
-        before_m = -turned[2] - _FACE_DEPTH_M
-        after_m = before_m / self.scale
-        offset_m = self.shift * torch.tensor([1.0, -1.0]) * after_m / CROP_FOCAL_PER_SIDE
-        return turn @ rotation, torch.cat([turned[:2] + offset_m, -(after_m + _FACE_DEPTH_M)[None]])
+def _draw_crop(centre_px: Tensor, side_px: float, generator: torch.Generator) -> Similarity:
+    """Draw a crop around the place of another, as detectors cut it."""
+    turns = torch.rand((), generator=generator) < _TURNED
+    turn_deg = float(Uniform(generator)(-_TURN_DEG, _TURN_DEG)) * bool(turns)
+    scale = math.exp(_SCALE * float(torch.randn((), generator=generator).clamp(-2, 2)))
+    shift = torch.tensor(_SHIFT) * torch.randn(2, generator=generator).clamp(-2, 2)
+    return Similarity.around(centre_px, side_px / scale, turn_deg, shift)
 
 
-def _composed(crop: Tensor, generator: torch.Generator) -> Tensor:
-    """Composite a crop [4, S, S] over a random background, and sometimes under an occluder: [3, S, S]."""
+def _composed(crop: Tensor, backgrounds: Tensor, generator: torch.Generator) -> Tensor:
+    """Composite a crop [4, S, S] over a background, and sometimes under an occluder: [3, S, S]."""
     side = crop.shape[-1]
-    image = crop[:3] + (1 - crop[3:]) * _background(side, generator)
+    image = crop[:3] + (1 - crop[3:]) * background(backgrounds, side, generator)
     if torch.rand((), generator=generator) < _OCCLUDED:
-        hidden = _occluder(side, generator)
-        image = image + hidden * (_background(side, generator) - image)
+        other = background(backgrounds, side, generator)
+        image = image + occluder(side, generator, _NEAREST_OCCLUDER) * (other - image)
     return image
-
-
-def _background(side: int, generator: torch.Generator) -> Tensor:
-    """Draw a random background [3, S, S]: blotches or rectangles of random size and contrast."""
-    uniform = Uniform(generator)
-    colour = torch.exp(uniform(-4.5, -0.5) + 0.35 * torch.randn(3, 1, 1, generator=generator))
-    cells = torch.randint(2, 40, (2,), generator=generator).tolist()
-    contrast = uniform(0, 1) ** 2 * 1.2
-    grey = torch.randn(1, 1, *cells, generator=generator) + 0.4 * torch.randn(
-        1, 3, *cells, generator=generator
-    )
-    if torch.rand((), generator=generator) < 0.3:
-        field = F.interpolate(grey, (side, side), mode="nearest")
-    else:
-        field = F.interpolate(grey, (side, side), mode="bilinear", align_corners=False)
-    return colour * torch.exp(contrast * field[0])
-
-
-def _occluder(side: int, generator: torch.Generator) -> Tensor:
-    """Draw the cover [1, S, S] of an occluder, an ellipse near the border of the crop."""
-    uniform = Uniform(generator)
-    angle, distance = uniform(0, 2 * math.pi), uniform(0.3, 0.6)
-    centre = 0.5 + distance * torch.stack([angle.cos(), angle.sin()])
-    radii, tilt = uniform(0.06, 0.22, 2), uniform(0, math.pi)
-    x, y = (texel_centres_uv(side) - centre).unbind(-1)
-    a, b = turned(x, y, tilt)
-    return ((1 - (a / radii[0]) ** 2 - (b / radii[1]) ** 2) * 8 + 0.5).clamp(0, 1)[None]
-
-
-def _with_camera_errors(image: Tensor, generator: torch.Generator) -> Tensor:
-    """Simulate a camera on a linear image [3, S, S]: colour cast, clipping, blur, tone curve, noise."""
-    uniform = Uniform(generator)
-    image = image * torch.exp(uniform(-0.2, 0.2, 3, 1, 1))
-    if torch.rand((), generator=generator) < _GREY:
-        image = image.mean(0, keepdim=True).expand(3, -1, -1)
-    clip = uniform(1.6, 6.0) * image.mean().clamp_min(1e-4)
-    image = (image / clip).clamp(0, 1)
-    image = gaussian_blurred(image, float(uniform(0, 1.3))) ** torch.exp(uniform(-0.3, 0.3))
-    noise = torch.randn(image.shape, generator=generator) * uniform(0, 0.04) ** 1.2
-    return (image + noise * (image + 0.02).sqrt()).clamp(0, 1)
-
-
-def turned(x: Tensor, y: Tensor, tilt: Tensor) -> tuple[Tensor, Tensor]:
-    """Coordinates along and across a direction that is turned by `tilt` radians."""
-    return x * tilt.cos() + y * tilt.sin(), y * tilt.cos() - x * tilt.sin()
-
-
-def gaussian_blurred(image: Tensor, sigma_px: float) -> Tensor:
-    """Blur an image [3, S, S] by a Gaussian, as two matrix products: the fastest way at this size."""
-    at = torch.arange(image.shape[-1])
-    kernel = torch.exp(-0.5 * ((at[:, None] - at) / max(sigma_px, 0.05)) ** 2)
-    kernel = kernel / kernel.sum(1, keepdim=True)
-    return kernel @ image @ kernel.T

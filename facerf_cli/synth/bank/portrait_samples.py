@@ -22,19 +22,18 @@ from facerf_cli.portrait.person import SIDES
 from facerf_cli.portrait.proxy import own_shading
 from facerf_cli.relighting.white import even_shade_of
 from facerf_cli.synth.bank import files_in, split_people
-from facerf_cli.synth.bank.face_crops import gaussian_blurred, turned
-from facerf_cli.synth.bank.portraits import Lamp, background_of, draw_photo_light
+from facerf_cli.synth.bank.portraits import Lamp, draw_photo_light
 from facerf_cli.synth.bank.texture_samples import in_front
 from facerf_cli.synth.bank.transport import seen_path
+from facerf_cli.synth.camera import SimulatedCamera, background, recoloured, turned
 from facerf_cli.synth.portraits import BakedPortrait, albedo_of, images_under
 from facerf_cli.synth.random_fields import Uniform
 from facerf_cli.synth.shading import Material
 
 _LAMP = Lamp(0.3, 0.01, 2, 0.3, 1.0)
-_GREY = 0.2  # share of grey photos
+_CAMERA = SimulatedCamera(grey=0.2, blur_px=1.2, phone=0.2, contrast=(0.0, 0.3))
 SMALL = 4  # pixels along each side that are averaged where the photo's own light is summed
 _SHADOWED = 0.25  # share of photos in the shadow of something that they do not show
-_PHONES, _CONTRAST = 0.2, 0.4  # shares of photos that a phone sharpens, and whose contrast a camera raises
 _EMPTY_BYTES = 1000  # a file without tensors is smaller
 _BRIGHTEST = 8.0  # of targets; brighter highlights are clipped
 # Lights from behind: elevation and least azimuth, and the share of targets that they get beside their own.
@@ -189,13 +188,14 @@ def sample_of(
     visible = seen["visible"].float() / 255
     around = seen["around"].float() / 255 if "around" in seen else visible
     directions = seen.get("around_directions", lit.rig)
-    images, albedo = _balanced(lit.images, lit.albedo, generator)
+    colours = _CAMERA.colours(generator)
+    images, albedo = recoloured(lit.images, colours), recoloured(lit.albedo, colours)
     skin, side = classes[SKIN], classes.shape[-1]
     scale = MEAN_RADIANCE / _mean_over(albedo, skin)
-    stored = backgrounds[_below(len(backgrounds), generator)]
-    background = 4 * background_of(stored, side, generator) * lit.behind
+    behind = 4 * recoloured(background(backgrounds, side, generator), colours) * lit.behind
     lit_skin = images[0] / _mean_over(images[0], skin)
-    photo = _as_taken(lit_skin * _foreign_shadow(side, generator) + background, generator)
+    scene = lit_skin * _foreign_shadow(side, generator) + behind
+    photo = _CAMERA.take(scene, torch.ones(()), generator)
     rows = int(seen.get("rows", side))
     photo = photo[:, torch.arange(side).clamp(max=rows - 1)]  # as a square beyond a photo's edge shows it
     shares = lit.shares.clone()
@@ -227,15 +227,6 @@ def sample_of(
     )
     batched = sample.each(lambda values: values[None])
     return mirrored(batched) if torch.rand((), generator=generator) < 0.5 else batched
-
-
-def _balanced(images: Tensor, albedo: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Images [N, 3, S, S] and albedo [3, S, S] in another white balance, some of them grey."""
-    balance = torch.exp(Uniform(generator)(-0.12, 0.12, 3, 1, 1))
-    images, albedo = images * balance, albedo * balance
-    if torch.rand((), generator=generator) < _GREY:
-        images, albedo = (x.mean(-3, keepdim=True).expand_as(x) for x in (images, albedo))
-    return images, albedo
 
 
 def _below(count: int, generator: torch.Generator) -> int:
@@ -278,28 +269,6 @@ def _foreign_shadow(side: int, generator: torch.Generator) -> Tensor:
     softness = torch.exp(uniform(math.log(0.01), math.log(0.4)))
     passes = uniform(0.15, 0.8) * torch.exp(uniform(-0.15, 0.15, 3, 1, 1))
     return torch.lerp(passes, torch.ones(3, 1, 1), torch.sigmoid(distance / softness))
-
-
-def _as_taken(image: Tensor, generator: torch.Generator) -> Tensor:
-    """Take a photo of a scene [3, S, S] with a mean of about 1.
-
-    Clipping, blur or a phone's smoothing and sharpening, tone curve, contrast and noise.
-    """
-    uniform = Uniform(generator)
-    image = (image / uniform(1.6, 6.0)).clamp(0, 1)
-    camera = torch.rand((), generator=generator)
-    if camera < 0.4:
-        image = gaussian_blurred(image, float(uniform(0.3, 1.2)))
-    elif camera < 0.4 + _PHONES:
-        smooth = torch.lerp(image, gaussian_blurred(image, float(uniform(0.8, 2))), uniform(0, 0.8))
-        sharper = smooth - gaussian_blurred(smooth, float(uniform(0.7, 1.5)))
-        image = (smooth + uniform(0.3, 1.2) * sharper).clamp(0, 1)
-    image = image ** torch.exp(uniform(-0.22, 0.22))
-    if torch.rand((), generator=generator) < _CONTRAST:
-        root = image.sqrt()  # nearly as it is shown
-        image = torch.lerp(root, root.square() * (3 - 2 * root), uniform(0, 0.6)).square()
-    noise = torch.randn(image.shape, generator=generator) * uniform(0, 0.02)
-    return (image + noise * (image + 0.02).sqrt()).clamp(0, 1)
 
 
 def mirrored(sample: PortraitSample) -> PortraitSample:

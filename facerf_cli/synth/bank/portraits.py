@@ -25,9 +25,9 @@ from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, pose_to_rotation
 from facerf_cli.synth.appearance.materials import Appearance, draw_appearance
 from facerf_cli.synth.bank import Files, fill
-from facerf_cli.synth.bank.face_crops import gaussian_blurred, turned
 from facerf_cli.synth.bank.heads import cached_face_model
 from facerf_cli.synth.bank.texture_samples import draw_light
+from facerf_cli.synth.camera import turned
 from facerf_cli.synth.portraits import BakedPortrait, bake_subject, images_under, materials_of, view_of
 from facerf_cli.synth.random_fields import Random, Uniform, generators
 from facerf_cli.synth.sky.skies import draw_sky
@@ -130,23 +130,6 @@ def _material(generator: torch.Generator, colour: Tensor) -> Tensor:
     blotches = torch.randn(1, 1, cells, cells, generator=generator) * uniform(0, 0.5)
     wide = F.interpolate(blotches, (BACKGROUND_PX, BACKGROUND_PX), mode="bilinear", align_corners=False)[0]
     return colour * wide.exp()
-
-
-def background_of(stored: Tensor, side: int, generator: torch.Generator) -> Tensor:
-    """Draw a background [3, side, side]: a part of a stored one, blurred by a lens, of any exposure."""
-    uniform = Uniform(generator)
-    reach = float(uniform(0.25, 1.0))
-    centre = (1 - reach) * uniform(-1, 1, 2)
-    at = torch.linspace(-1, 1, side) * reach
-    y, x = torch.meshgrid(at + centre[1], at + centre[0], indexing="ij")
-    grid = torch.stack([x, y], -1)[None]
-    seen = F.grid_sample((stored.float() / 255).square()[None], grid, align_corners=False)[0]
-    if torch.rand((), generator=generator) < 0.2:  # a plain wall
-        seen = gaussian_blurred(seen, side / 6)
-    elif torch.rand((), generator=generator) < 0.5:
-        seen = gaussian_blurred(seen, float(uniform(0, 8)))
-    exposure = torch.exp(uniform(-3.0, 1.0)) / 6 / seen.mean().clamp_min(1e-4)
-    return seen * exposure * torch.exp(uniform(-0.2, 0.2, 3, 1, 1))
 
 
 BRIGHTEST = 6.0  # largest stored radiance, over the mean radiance of the person

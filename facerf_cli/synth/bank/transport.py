@@ -37,12 +37,12 @@ from facerf_cli.synth.appearance.materials import Appearance
 from facerf_cli.synth.bank import Files, file_of, fill
 from facerf_cli.synth.bank.heads import cached_face_model
 from facerf_cli.synth.bank.portraits import (
-    background_of,
     draw_looks,
     draw_turn,
     seen_by,
 )
 from facerf_cli.synth.bank.texture_samples import draw_light
+from facerf_cli.synth.camera import background
 from facerf_cli.synth.portraits import BakedPortrait, images_under, materials_of, portrait_tensors
 from facerf_cli.synth.random_fields import Random, generators
 from facerf_cli.synth.shading import Material
@@ -243,12 +243,11 @@ def seen_in(
     Nothing where no face is found in it.
     """
     generator = torch.Generator().manual_seed(seed)
-    chosen = backgrounds[int(torch.randint(len(backgrounds), (), generator=generator))]
     behind = 1 - photo["alpha"].float() / 255
     squares = [Crop(x, y, side, int(size)) for x, y, side, size in photo["squares"].tolist()]
     rows = int(photo.get("rows", torch.tensor(len(behind))))
     for image in photo["lit"].float():
-        scene = (image * 0.1 + behind * background_of(chosen, len(behind), generator))[:, :rows]
+        scene = (image * 0.1 + behind * background(backgrounds, len(behind), generator))[:, :rows]
         exposed = (scene / scene.mean().clamp_min(1e-6) * 0.2).permute(1, 2, 0).numpy()
         with suppress(InputError):
             person = person_in(people, exposed)

@@ -12,6 +12,7 @@ from facerf_cli.face.morphable import load_face_model
 from facerf_cli.portrait.parse import MORE_LANDMARKS, class_index
 from facerf_cli.synth.bank import parsing
 from facerf_cli.synth.bank.parsing import FeatureWarp, PortraitCrops, StoredPortraits
+from facerf_cli.synth.camera import SimulatedCamera
 from tests.kinds import Folders, Patch
 from tests.refusals import refused
 
@@ -136,8 +137,9 @@ def test_decoys_have_the_persons_colours_and_lie_behind(
     portraits: StoredPortraits, monkeypatch: Patch
 ) -> None:
     """Each image over black, with decoys and without: the person stays, and shapes appear around it."""
-    monkeypatch.setattr(StoredPortraits, "_background", lambda self, side, _: torch.zeros(3, side, side))
-    monkeypatch.setattr(parsing, "_as_taken", lambda image, generator: image)
+    monkeypatch.setattr(parsing, "background", lambda stored, side, _: torch.zeros(3, side, side))
+    monkeypatch.setattr(SimulatedCamera, "colours", lambda self, _: torch.eye(3))
+    monkeypatch.setattr(SimulatedCamera, "take", lambda self, image, mean, _: image)
     found = {}
     for share in (0.0, 1.0):
         monkeypatch.setattr(parsing, "_DECOYED", share)

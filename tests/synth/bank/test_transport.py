@@ -155,23 +155,6 @@ def test_shadows_of_what_is_not_seen_fall_on_a_quarter_of_photos() -> None:
     assert sum(float(share.max() - share.min()) > 0.15 for share in shadowed) > 0.7 * len(shadowed)
 
 
-def test_phones_sharpen_and_raise_contrast(monkeypatch: pytest.MonkeyPatch) -> None:
-    step = torch.where(torch.arange(32) < 16, 0.6, 1.4).expand(3, 32, 32)
-
-    def of_step(phones: float, contrast: float) -> tuple[float, float]:
-        """The most by which a photo overshoots, and the mean difference of the sides over their mean."""
-        monkeypatch.setattr(portrait_samples, "_PHONES", phones)
-        monkeypatch.setattr(portrait_samples, "_CONTRAST", contrast)
-        photos = [portrait_samples._as_taken(step, torch.Generator().manual_seed(seed)) for seed in range(40)]
-        lines = torch.stack(photos).sqrt().mean((1, 2))
-        high, low = lines[:, 24:28].mean(1), lines[:, 4:8].mean(1)
-        overshoot = (lines[:, 16:20].amax(1) / high - 1).max()
-        return float(overshoot), float(((high - low) / (high + low)).mean())
-
-    (plain, flat), (sharp, _), (_, steep) = of_step(0, 0), of_step(1, 0), of_step(0, 1)
-    assert plain < 0.02 < 0.04 < sharp and steep > 1.02 * flat
-
-
 def test_the_network_sees_shaded_skin_in_the_colour_of_lit_skin(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
