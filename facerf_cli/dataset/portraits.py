@@ -40,8 +40,8 @@ from facerf_cli.synth.bank.portrait_samples import (
     sample_of,
     source_light,
 )
+from facerf_cli.synth.bank.proxies import layers_of, person_in
 from facerf_cli.synth.bank.texture_samples import draw_target_lights
-from facerf_cli.synth.bank.transport import layers_of, person_in
 
 _AROUND = 48  # lights of the rig all around whose shadows are summarised, as of photos
 log = logging.getLogger(LOGGER_NAME)

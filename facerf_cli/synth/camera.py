@@ -20,13 +20,14 @@ from facerf_cli.raster.texture import texel_centres_uv
 from facerf_cli.synth.random_fields import Uniform
 
 _FACE_DEPTH_M = 0.11  # distance from the face back to the origin of the head frame
-_BLURRED = 0.7  # fraction of photos that are not sharp, if the camera is no phone
+_BLURRED = 0.7  # fraction of photos, other than a phone's, that are blurred
 _JPEG_QUALITY = (15, 95)
+_POOLED_PX = 1.5  # pixels are averaged if samples are farther apart
 
 
 @dataclass(frozen=True)
 class SimulatedCamera:
-    """Ranges of the errors of a camera, in the order in which `colours` and `take` apply them."""
+    """Ranges of the errors of a camera, in the order that `colours` and `take` apply them."""
 
     balance: float = 0.12  # largest log of the gain of a channel
     grey: float = 0.25  # fraction of photos without colours
@@ -131,10 +132,14 @@ class Similarity(NamedTuple):
         return turn @ rotation, torch.cat([turned[:2] + offset_m, -(after_m + _FACE_DEPTH_M)[None]])
 
 
-def resample(image: Tensor, positions_px: Tensor, beyond: str = "border", mode: str = "bilinear") -> Tensor:
-    """Sample an image [C, H, H] at positions [S, S, 2] in its pixels: [C, S, S]."""
+def resample(image: Tensor, positions_px: Tensor) -> Tensor:
+    """Sample an image [C, H, H] at positions [S, S, 2] in its pixels: [C, S, S]; distant ones are means."""
+    side = len(positions_px)
+    step_px = float((positions_px[0, -1] - positions_px[0, 0]).norm()) / (side - 1)
     grid = 2 * positions_px / image.shape[-1] - 1
-    return F.grid_sample(image[None], grid[None], mode, beyond, align_corners=False)[0]
+    if step_px > _POOLED_PX:
+        image = F.avg_pool2d(image, round(step_px), ceil_mode=True, count_include_pad=False)
+    return F.grid_sample(image[None], grid[None], padding_mode="border", align_corners=False)[0]
 
 
 def rotation_2d(radians: float) -> Tensor:
@@ -159,7 +164,7 @@ def gaussian_blurred(image: Tensor, sigma_px: float) -> Tensor:
 def background(stored: Tensor, side: int, generator: torch.Generator) -> Tensor:
     """Draw a background [3, side, side]: a part of one of a bank, blurred by a lens, at any exposure.
 
-    stored [N, 3, S, S] uint8 are those of `load_backgrounds`.
+    stored [N, 3, S, S] uint8 comes from `load_backgrounds`.
     """
     uniform = Uniform(generator)
     chosen = stored[int(torch.randint(len(stored), (), generator=generator))]

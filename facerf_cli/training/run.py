@@ -31,24 +31,14 @@ from facerf_cli.network.installed import installed
 from facerf_cli.relighting.models import Networks
 from facerf_cli.run.logs import LOGGER_NAME, STDERR
 from facerf_cli.run.machine import processors
-from facerf_cli.synth.bank.face_crops import RenderedFaces, add_head_images
+from facerf_cli.synth.bank.backgrounds import BACKGROUND_HEAPS, BACKGROUND_MAPS, load_backgrounds
+from facerf_cli.synth.bank.face_crops import RenderedFaces
 from facerf_cli.synth.bank.heads import add_views, bake_heads, load_bank
 from facerf_cli.synth.bank.parsing import StoredPortraits
+from facerf_cli.synth.bank.people import TINY_BANK, PeopleBankSettings, add_people
 from facerf_cli.synth.bank.portrait_samples import PortraitSource, StoredTransport
-from facerf_cli.synth.bank.portraits import (
-    BACKGROUND_HEAPS,
-    BACKGROUND_MAPS,
-    PortraitBankSettings,
-    add_portraits,
-    load_backgrounds,
-)
+from facerf_cli.synth.bank.proxies import add_proxies
 from facerf_cli.synth.bank.texture_samples import SampleSource
-from facerf_cli.synth.bank.transport import (
-    TINY_BANK,
-    TransportBankSettings,
-    add_proxies,
-    add_transport,
-)
 from facerf_cli.synth.head.mesh import MAKEHUMAN_LICENCE
 from facerf_cli.training.diffuse_sh import DiffuseObjective, SumSettings
 from facerf_cli.training.geometry import GeometryObjective, GeometryObjectiveSettings
@@ -164,12 +154,10 @@ class _TrainedStage:
         return self._kind(DiffuseObjective)(self._samples(), self.make.network("diffuse_sh"), settings)
 
     def geometry(self) -> Objective:
-        """The Geometry Network on rendered heads."""
-        options, sizes, folder = self.options, self.make.sizes, self._bank
-        provenance = self._bake()
-        images = folder / "pictures"
-        add_head_images(folder / "heads", images, sizes.images, options.jobs, options.settings.seed)
-        faces = RenderedFaces(images, self._backgrounds(folder), provenance)
+        """The Geometry Network on photos of synthetic people."""
+        sizes = self.make.sizes
+        folder, provenance = self._people(sizes.held_out_heads, with_squares=False)
+        faces = RenderedFaces(folder, self._backgrounds(self._bank), provenance)
         network = self.make.geometry(faces.mean_translation_m())
         settings = GeometryObjectiveSettings(held_out_heads=sizes.held_out_heads)
         return self._kind(GeometryObjective)(faces, network, settings)
@@ -198,11 +186,8 @@ class _TrainedStage:
         return kind(dataset, model, reflectance, geometry, appearance, light, photos, settings)
 
     def parsing(self) -> Objective:
-        """The Parsing Network on photos of synthetic people, which are taken first where they are missing."""
-        options, folder, tiny = self.options, self._bank / "portraits", self.options.preset == "tiny"
-        people, models, provenance = self._whole_people(self.make.sizes.held_out_heads)
-        settings = PortraitBankSettings(views=1, photos=1, side_px=96) if tiny else PortraitBankSettings()
-        add_portraits(folder, models, people, options.jobs, options.settings.seed, settings)
+        """The Parsing Network on photos of synthetic people."""
+        folder, provenance = self._people(self.make.sizes.held_out_heads, with_squares=False)
         stored = StoredPortraits(folder, self._backgrounds(self._bank), provenance)
         objective = ParsingObjectiveSettings(held_out_people=self.make.sizes.held_out_heads)
         return self._kind(ParsingObjective)(stored, self.make.network("parsing"), objective)
@@ -221,14 +206,10 @@ class _TrainedStage:
         return self._kind(PortraitObjective)(source, self.make.network("portrait"), settings)
 
     def _stored_transport(self) -> StoredTransport:
-        """Synthetic people; those that are missing in the bank are baked and looked at first."""
-        options, folder = self.options, self._bank / "transport"
-        people, models, provenance = self._whole_people(self._held_out_of_few)
-        tiny, seed = options.preset == "tiny", options.settings.seed
-        settings = TINY_BANK if tiny else TransportBankSettings()
-        add_transport(folder, models, people, options.jobs, seed, settings)
-        backgrounds = self._backgrounds(self._bank)
-        add_proxies(folder, backgrounds, self.networks, options.jobs, seed)
+        """Synthetic people, and what the networks see of them."""
+        folder, provenance = self._people(self._held_out_of_few, with_squares=True)
+        backgrounds, options = self._backgrounds(self._bank), self.options
+        add_proxies(folder, backgrounds, self.networks, options.jobs, options.settings.seed)
         return StoredTransport(folder, backgrounds, provenance)
 
     @property
@@ -236,18 +217,21 @@ class _TrainedStage:
         """Number of people that the stage portrait holds out: an eighth of a small bank."""
         return min(self.make.sizes.held_out_heads, max(1, self.make.sizes.heads // 8))
 
-    def _whole_people(self, held_out: int) -> tuple[range, list[str], dict[str, Any]]:
-        """Numbers of synthetic people, the face models that they take turns in, and their provenance."""
-        sizes, models = self.make.sizes, self.options.heads_from.split(",")
-        if sizes.heads <= held_out:
-            raise UsageError(f"--heads {sizes.heads}: {held_out} people are held out; give more")
+    def _people(self, held_out: int, with_squares: bool) -> tuple[Path, dict[str, Any]]:
+        """Bake the synthetic people that are missing; return their folder and their provenance."""
+        options, heads = self.options, self.make.sizes.heads
+        if heads <= held_out:
+            raise UsageError(f"--heads {heads}: {held_out} people are held out; use more")
+        folder, models = self._bank / "people", options.heads_from.split(",")
         drawn = [load_face_model(model) for model in models]
+        settings = TINY_BANK if options.preset == "tiny" else PeopleBankSettings()
+        settings = replace(settings, with_squares=with_squares)
+        add_people(folder, models, range(heads), options.jobs, options.settings.seed, settings)
         shapes = [f"the heads' shapes: {model.licence}" for model in drawn]
-        provenance = {
+        return folder, {
             "heads": f"synthetic people drawn from {' and '.join(model.credit for model in drawn)}",
             "licence": "; ".join(["MIT", *shapes, MAKEHUMAN_LICENCE]),
         }
-        return range(sizes.heads), models, provenance
 
     def _backgrounds(self, folder: Path) -> Tensor:
         """Backgrounds of photos, drawn where the folder lacks their file."""

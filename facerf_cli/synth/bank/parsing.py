@@ -1,8 +1,9 @@
 """Training crops for the Parsing Network: stored photos of synthetic people, altered for every sample.
 
 A stored photo (`portraits.py`) is mirrored or not, turned, scaled and shifted in the crop, over a background,
-sometimes with another person in it or something before the face. A camera then degrades it. Wide variation is
-what makes training on synthetic people serve for real ones (Wood et al., *Fake it till you make it*, 2021).
+sometimes with another person in it or something in front of the face. A camera then degrades it. Wide
+variation lets training on synthetic people serve for real ones (Wood et al., *Fake it till you make it*,
+2021).
 
 Synthetic people have brows and lips at the same places of one mesh, and a network could guess them from the
 rest of the face. So most faces are warped: real brows lie higher or lower, real lips are thinner or thicker.
@@ -16,15 +17,16 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from safetensors import safe_open
 from torch import Tensor
 
 from facerf_cli.image.colour import linear_to_srgb
 from facerf_cli.network.inputs import Batch
-from facerf_cli.portrait.parse import MIRROR, class_index
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.raster.texture import texel_centres_uv
-from facerf_cli.synth.bank import files_in, split_people
+from facerf_cli.synth.bank import split_people
+from facerf_cli.synth.bank.heads import LANDMARK_GROUPS
+from facerf_cli.synth.bank.people import Photo, photos_in, read_photo
 from facerf_cli.synth.camera import (
     Similarity,
     SimulatedCamera,
@@ -38,20 +40,35 @@ from facerf_cli.synth.camera import (
 )
 from facerf_cli.synth.random_fields import Uniform
 
-_FEATURES = (slice(17, 22), slice(22, 27), slice(27, 36), slice(36, 42), slice(42, 48), slice(48, 68))
+_FEATURES = LANDMARK_GROUPS[1:]
 _REACHES = (0.10, 0.10, 0.12, 0.08, 0.08, 0.13)  # standard deviations, in extents of the 68 landmarks
 _MOVE_STD = 0.02  # in extents
 _STRETCH_STD = 0.15
 _MOST = 2.0  # standard deviations; beyond it a warp could fold
 _ROUNDS = 8  # of the search for the place that is taken from another; each lowers its error threefold
+# Shares of samples: without a person, of a body without its head, turned far, with a second person, and
+# with something in front of the face; of a face whose features were moved; with decoys behind the person.
+_EMPTY, _HEADLESS, _TURNED_FAR, _SECOND, _OCCLUDED = 0.06, 0.05, 0.15, 0.3, 0.25
+_WARPED, _DECOYED = 0.75, 0.6
+_DECOYS, _TOUCHING = 8, 0.5  # behind a person at most; share of them that touch the person's outline
+_TURN_DEG, _FAR_TURN_DEG = 12.0, 50.0  # standard deviation of the turn; largest of the far ones
+# Sides of the crop in extents of the landmarks: of the face, of the portrait, of a whole photo; their shares.
+_SIDES, _SIDE_SHARES = ((1.25, 2.2), (2.4, 4.6), (4.6, 10.0)), (0.4, 0.4, 0.2)
+_SHIFT = (0.08, 0.12, 0.24)  # largest distance of the face from the crop's centre, in sides, for these
+_NEAREST_OCCLUDER = 0.1  # distance from the crop's middle, in sides
+_CAMERA = SimulatedCamera(
+    0.25, white=(1.35, 9.0), blur_px=2.5, curve=0.45, contrast=(-0.5, 0.25), lift=0.08, noise=0.2, jpeg=0.4
+)
+_BORDERED = 0.2  # fraction of crops that reach beyond the photo, where its border repeats
+_BUST_BELOW = (0.8, 0.6, 0.3)  # share of crops of each side that end where the stored photo ends, or above
 
 
 @dataclass(frozen=True)
 class FeatureWarp:
-    """A smooth warp of the plane: what is shown at p is taken from p + `shift(p)`; all in pixels.
+    """Smooth warp of the plane, in pixels: the image at p shows the source at p + `shift(p)`.
 
-    Of each of K features: its centre [K, 2] and reach [K], how far it moves [K, 2], and how much it is
-    stretched [K, 2] along x and y.
+    Each of K features has a centre [K, 2] and a reach [K], moves by [K, 2], and is stretched by [K, 2] along
+    x and y.
     """
 
     centres: Tensor
@@ -85,28 +102,11 @@ class FeatureWarp:
         return total
 
     def shown_at(self, places: Tensor) -> Tensor:
-        """Places at which those at [..., 2] are shown, the inverse of the warp."""
+        """Return where points [..., 2] are shown: the inverse of the warp."""
         shown = places
         for _ in range(_ROUNDS):
             shown = places - self.shift(shown)
         return shown
-
-
-# Shares of samples: without a person, of a body without its head, turned far, with a second person, and
-# with something before the face; of a face whose features were moved; with decoys behind the person.
-_EMPTY, _HEADLESS, _TURNED_FAR, _SECOND, _OCCLUDED = 0.06, 0.05, 0.15, 0.3, 0.25
-_WARPED, _DECOYED = 0.75, 0.6
-_DECOYS, _TOUCHING = 8, 0.5  # behind a person at most; share of them that touch the person's outline
-_TURN_DEG, _FAR_TURN_DEG = 12.0, 50.0  # standard deviation of the turn; largest of the far ones
-# Sides of the crop in extents of the landmarks: of the face, of the portrait, of a whole photo; their shares.
-_SIDES, _SIDE_SHARES = ((1.25, 2.2), (2.4, 4.6), (4.6, 10.0)), (0.4, 0.4, 0.2)
-_SHIFT = (0.08, 0.12, 0.24)  # largest distance of the face from the crop's centre, in sides, for these
-_NEAREST_OCCLUDER = 0.1  # distance from the crop's middle, in sides
-_CAMERA = SimulatedCamera(
-    0.25, white=(1.35, 9.0), blur_px=2.5, curve=0.45, contrast=(-0.5, 0.25), lift=0.08, noise=0.2, jpeg=0.4
-)
-_BORDERED = 0.2  # share of crops that reach beyond the photo, where its border goes on
-_BUST_BELOW = (0.8, 0.6, 0.3)  # share of crops of each side that end where the stored photo ends, or above
 
 
 @dataclass(frozen=True)
@@ -122,36 +122,16 @@ class PortraitCrops(Batch):
     present: Tensor  # [B] whether there is a person
 
 
-@dataclass(frozen=True, eq=False)
-class _Photo:
-    """One stored photo: radiance [3, P, P] times alpha, alpha [P, P], label [P, P], landmarks [N, 2]."""
-
-    radiance: Tensor
-    alpha: Tensor
-    label: Tensor
-    landmarks_px: Tensor
-
-    @property
-    def side_px(self) -> int:
-        return self.alpha.shape[-1]
-
-    def mirrored(self) -> "_Photo":
-        flipped = self.landmarks_px[torch.from_numpy(MIRROR)] * torch.tensor([-1.0, 1.0])
-        moved = flipped + torch.tensor([float(self.side_px), 0.0])
-        return _Photo(self.radiance.flip(-1), self.alpha.flip(-1), self.label.flip(-1), moved)
-
-
 class StoredPortraits:
-    """The bank's photos, read when they are drawn."""
+    """Photos of a bank, read when they are drawn."""
 
     def __init__(self, folder: Path, backgrounds: Tensor, provenance: dict[str, Any]) -> None:
-        self.paths = files_in(folder, "no portraits; make them with `facerf train --stage parsing`")
+        self.photos = photos_in(folder)
         self.backgrounds = backgrounds
         self.provenance = provenance
 
     def people(self, held_out: int) -> tuple[list[int], list[int]]:
-        """See `split_people`."""
-        return split_people(len(self.paths), held_out)
+        return split_people(len(self.photos), held_out)
 
     def draw(self, people: Sequence[int], side: int, generator: torch.Generator) -> PortraitCrops:
         """Draw one crop [1, ...] of one of some people."""
@@ -177,16 +157,10 @@ class StoredPortraits:
         crop = replace(crop, crops=torch.from_numpy(linear_to_srgb(taken.numpy()))[None])
         return _bordered(crop, generator) if torch.rand((), generator=generator) < _BORDERED else crop
 
-    def _photo(self, people: Sequence[int], generator: torch.Generator) -> _Photo:
-        """Read a random photo of one of some people, mirrored or not."""
-        path = self.paths[people[int(torch.randint(len(people), (), generator=generator))]]
-        with safe_open(path, framework="pt") as file:
-            views, photos = file.get_slice("pictures").get_shape()[:2]
-            view, picture = (int(torch.randint(count, (), generator=generator)) for count in (views, photos))
-            stored = file.get_slice("pictures")[view, picture]
-            alpha, label = (file.get_slice(name)[view] for name in ("alpha", "label"))
-            landmarks_px = file.get_slice("landmarks_px")[view]
-        photo = _Photo((stored.float() / 255).square(), alpha.float() / 255, label, landmarks_px)
+    def _photo(self, people: Sequence[int], generator: torch.Generator) -> Photo:
+        """Read a random photo of a random person of `people`, mirrored or not."""
+        photos = self.photos[people[int(torch.randint(len(people), (), generator=generator))]]
+        photo = read_photo(photos[int(torch.randint(len(photos), (), generator=generator))], generator)
         return photo.mirrored() if torch.rand((), generator=generator) < 0.5 else photo
 
     def _composed(
@@ -208,8 +182,7 @@ class StoredPortraits:
         return crop.crops[0] + (1 - crop.alpha) * image
 
 
-def _draw_crop(photo: _Photo, generator: torch.Generator) -> Similarity:
-    """Draw the position of a crop around a face."""
+def _draw_crop(photo: Photo, generator: torch.Generator) -> Similarity:
     uniform = Uniform(generator)
     framing = int(torch.multinomial(torch.tensor(_SIDE_SHARES), 1, generator=generator))
     low, high = _SIDES[framing]
@@ -225,7 +198,7 @@ def _draw_crop(photo: _Photo, generator: torch.Generator) -> Similarity:
     return crop
 
 
-def _draw_crop_below(photo: _Photo, generator: torch.Generator) -> Similarity:
+def _draw_crop_below(photo: Photo, generator: torch.Generator) -> Similarity:
     """Draw a crop of the body below the head, where badges and folds can look like faces."""
     uniform = Uniform(generator)
     extents = float(uniform(0.5, 1.3))
@@ -233,7 +206,7 @@ def _draw_crop_below(photo: _Photo, generator: torch.Generator) -> Similarity:
     return Similarity.around(_middle(photo), extents * _extent(photo), 0, -torch.stack([x, y]) / extents)
 
 
-def _draw_crop_aside(photo: _Photo, generator: torch.Generator) -> Similarity:
+def _draw_crop_aside(photo: Photo, generator: torch.Generator) -> Similarity:
     """Draw a crop beside a face, which lies near its border or is cut by it."""
     uniform = Uniform(generator)
     side_px = _extent(photo) * float(torch.exp(uniform(math.log(2.2), math.log(9))))
@@ -241,7 +214,7 @@ def _draw_crop_aside(photo: _Photo, generator: torch.Generator) -> Similarity:
     return Similarity.around(_middle(photo), side_px, 0, torch.cat([x, uniform(-0.35, 0.2, 1)]))
 
 
-def _cropped(photo: _Photo, crop: Similarity, side: int, warp: FeatureWarp | None = None) -> PortraitCrops:
+def _cropped(photo: Photo, crop: Similarity, side: int, warp: FeatureWarp | None = None) -> PortraitCrops:
     """Resample a photo, with its features moved by `warp`: the image is radiance times alpha over black.
 
     Below the stored photo its lowest row repeats; that is correct where it shows a garment. Beside it,
@@ -251,15 +224,11 @@ def _cropped(photo: _Photo, crop: Similarity, side: int, warp: FeatureWarp | Non
     landmarks_px = photo.landmarks_px
     if warp is not None:
         positions_px, landmarks_px = positions_px + warp.shift(positions_px), warp.shown_at(landmarks_px)
-    stored = torch.cat([photo.radiance, photo.alpha[None]])
-    stored_px = crop.side_px / side  # for each pixel of the crop
-    if stored_px > 1.5:
-        stored = F.avg_pool2d(stored, round(stored_px), ceil_mode=True, count_include_pad=False)
-    image = resample(stored, positions_px * (stored.shape[-1] / photo.side_px))
-    label = resample(photo.label[None].float(), positions_px, mode="nearest")[0]
-    beyond = positions_px / photo.side_px
-    beside = (beyond[..., 0] < 0) | (beyond[..., 0] > 1) | (beyond[..., 1] < 0)
-    below = (beyond[..., 1] > 1) & (label != class_index("garment"))
+    image = resample(torch.cat([photo.radiance, photo.alpha[None]]), positions_px)
+    grid, stored = 2 * positions_px / photo.side_px - 1, photo.label[None, None].float()
+    label = F.grid_sample(stored, grid[None], "nearest", "border", align_corners=False)[0, 0]
+    beside = (grid[..., 0].abs() > 1) | (grid[..., 1] < -1)
+    below = (grid[..., 1] > 1) & (label != class_index("garment"))
     lost = (beside | below) & (image[3] > 0)
     landmarks = crop.in_crop(landmarks_px)
     known = ((landmarks > 0.01) & (landmarks < 0.99)).all(-1)  # false for NaN
@@ -274,13 +243,13 @@ def _cropped(photo: _Photo, crop: Similarity, side: int, warp: FeatureWarp | Non
     )
 
 
-def _extent(photo: _Photo) -> float:
-    """Larger side of the bounds of the 68 landmarks, in stored pixels."""
+def _extent(photo: Photo) -> float:
+    """Return the larger side of the bounds of the 68 landmarks, in stored pixels."""
     face = photo.landmarks_px[:68]
     return float((face.amax(0) - face.amin(0)).max())
 
 
-def _middle(photo: _Photo) -> Tensor:
+def _middle(photo: Photo) -> Tensor:
     face = photo.landmarks_px[:68]
     return (face.amax(0) + face.amin(0)) / 2
 
@@ -297,7 +266,7 @@ def _without_person(crop: PortraitCrops) -> PortraitCrops:
 
 
 def _bordered(crop: PortraitCrops, generator: torch.Generator) -> PortraitCrops:
-    """End the photo somewhere in the crop: from there on its border goes on, as in `parse.Square.cut`."""
+    """End the photo somewhere in the crop; its border repeats beyond, like in `parse.Square.cut`."""
     side = crop.alpha.shape[-1]
     ends = [int(float(end) * side) for end in Uniform(generator)(0, 0.18, 4)]
     at = torch.arange(side)
@@ -317,7 +286,7 @@ def _with_decoys(image: Tensor, crop: PortraitCrops, generator: torch.Generator)
 
     Behind real people stand things as dark as their hair and as white as their collars. A decoy shows the
     person's image, turned and scaled, so neither colour nor texture tells it from the person. Half of them
-    touch the person's outline, where they are most easily taken for hair.
+    touch the person's outline, where they are most easily mistaken for hair.
     """
     uniform, side = Uniform(generator), crop.alpha.shape[-1]
     person = torch.cat([crop.crops[0], crop.alpha])
@@ -336,7 +305,7 @@ def _with_decoys(image: Tensor, crop: PortraitCrops, generator: torch.Generator)
 
 
 def _outline(alpha: Tensor) -> Tensor:
-    """Places [N, 2] in sides, (x, y), of the pixels just off a person of `alpha` [S, S]."""
+    """Return positions [N, 2] in sides, (x, y), of the pixels just off a person of `alpha` [S, S]."""
     person = (alpha > 0.5).float()[None, None]
     around = F.max_pool2d(person, 5, 1, 2) - person
     return (around[0, 0].nonzero().flip(-1) + PIXEL_CENTRE) / alpha.shape[-1]

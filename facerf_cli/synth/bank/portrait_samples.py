@@ -1,6 +1,6 @@
 """Samples that the Portrait Network is trained on: a photo in a random light, and under single lights.
 
-The people are those of a bank (`transport.py`), or of a dataset (`dataset/portraits.py`).
+The people come from a bank (`people.py`) or a dataset (`dataset/portraits.py`).
 """
 
 import math
@@ -22,15 +22,15 @@ from facerf_cli.portrait.person import SIDES
 from facerf_cli.portrait.proxy import own_shading
 from facerf_cli.relighting.white import even_shade_of
 from facerf_cli.synth.bank import files_in, split_people
-from facerf_cli.synth.bank.portraits import Lamp, draw_photo_light
+from facerf_cli.synth.bank.people import KeyLight, draw_photo_light
+from facerf_cli.synth.bank.proxies import seen_path
 from facerf_cli.synth.bank.texture_samples import in_front
-from facerf_cli.synth.bank.transport import seen_path
 from facerf_cli.synth.camera import SimulatedCamera, background, recoloured, turned
-from facerf_cli.synth.portraits import BakedPortrait, albedo_of, images_under
 from facerf_cli.synth.random_fields import Uniform
+from facerf_cli.synth.renderer import BakedView, albedo_of, images_under
 from facerf_cli.synth.shading import Material
 
-_LAMP = Lamp(0.3, 0.01, 2, 0.3, 1.0)
+_KEY_LIGHT = KeyLight(0.3, 0.01, 2, 0.3, 1.0)
 _CAMERA = SimulatedCamera(grey=0.2, blur_px=1.2, phone=0.2, contrast=(0.0, 0.3))
 SMALL = 4  # pixels along each side that are averaged where the photo's own light is summed
 _SHADOWED = 0.25  # share of photos in the shadow of something that they do not show
@@ -42,15 +42,10 @@ _BACK_EL_DEG, _BACK_AZ_DEG, _BACK = (0.0, 40.0), 120.0, 0.08
 
 @dataclass(frozen=True, eq=False)
 class StoredView:
-    """One view of the bank, and the materials of its facets in several looks."""
+    """View from a bank, and the materials of its facets in several looks."""
 
-    portrait: BakedPortrait
+    portrait: BakedView
     looks: list[Material]
-
-    @property
-    def alpha(self) -> Tensor:
-        """Cover [S, S] of the person."""
-        return 1 - self.portrait.classes[..., 0].float() / 255
 
 
 def load_view(path: Path) -> StoredView:
@@ -60,12 +55,12 @@ def load_view(path: Path) -> StoredView:
     )
     relief = torch.zeros(albedo.shape[1], 2)
     looks = [Material(*look, relief) for look in zip(albedo, specular, roughness, strict=True)]
-    return StoredView(BakedPortrait(**tensors), looks)
+    return StoredView(BakedView.unpacked(tensors), looks)
 
 
 @dataclass(frozen=True)
 class PortraitSample(Batch):
-    """Photos of B people, what is seen in them, and T target images of each."""
+    """Photos of B people, what the networks see in them, and T target images of each."""
 
     inputs: PortraitInputs
     lights: Tensor  # [B, T, 3] of the targets
@@ -82,30 +77,26 @@ class PortraitSample(Batch):
 
 
 class PortraitSource(Protocol):
-    """People to draw samples of: synthetic ones, or those of a dataset (`dataset/portraits.py`)."""
+    """People to draw samples of: synthetic, or from a dataset (`dataset/portraits.py`)."""
 
     @property
     def provenance(self) -> dict[str, Any]:
         """Origin and licence of the people."""
-        ...
 
     def people(self, held_out: int) -> tuple[list[int], list[int]]:
         """Indices of the people to train on, and of at most `held_out` others."""
-        ...
 
     def sides_px(self, people: Sequence[int]) -> list[int]:
         """Sides of the squares of some people, of each square."""
-        ...
 
     def draw(
         self, people: Sequence[int], targets: int, generator: torch.Generator, side_px: int | None = None
     ) -> PortraitSample:
         """Draw one sample [1, ...] of some people, with `targets` lights, of a side if one is given."""
-        ...
 
 
 class StoredTransport:
-    """The bank's portraits, read when they are drawn."""
+    """Squares of a bank, read when they are drawn."""
 
     def __init__(self, folder: Path, backgrounds: Tensor, provenance: dict[str, Any]) -> None:
         people: dict[str, dict[Path, int]] = {}
@@ -119,22 +110,19 @@ class StoredTransport:
         self.provenance = provenance
 
     def people(self, held_out: int) -> tuple[list[int], list[int]]:
-        """See `split_people`."""
         return split_people(len(self.views), held_out)
 
     def sides_px(self, people: Sequence[int]) -> list[int]:
-        """See `PortraitSource`."""
         return [side for one in people for side in self.views[one].values()]
 
     def draw(
         self, people: Sequence[int], targets: int, generator: torch.Generator, side_px: int | None = None
     ) -> PortraitSample:
-        """See `PortraitSource`."""
         of_side = (
             [path for path, side in self.views[one].items() if side_px in (None, side)] for one in people
         )
-        found = [paths for paths in of_side if paths]
-        views = found[_below(len(found), generator)]
+        of_people = [paths for paths in of_side if paths]
+        views = of_people[_below(len(of_people), generator)]
         path = views[_below(len(views), generator)]
         view = load_view(path)
         surface = view.looks[_below(len(view.looks), generator)]
@@ -147,8 +135,8 @@ class StoredTransport:
             images=images_under(view.portrait, surface, torch.cat([weights[None], single])),
             albedo=albedo,
             normals=normals,
-            shares=view.portrait.classes.permute(2, 0, 1).float() / 255,
-            behind=1 - view.alpha,
+            shares=view.portrait.classes.permute(2, 0, 1),
+            behind=1 - view.portrait.alpha,
             rig=rig,
             weights=weights,
             chosen=chosen,
@@ -157,18 +145,17 @@ class StoredTransport:
 
 
 def _side_px(path: Path) -> int:
-    """Side of the square of a view."""
     with safe_open(path, framework="pt") as file:
         return int(file.get_slice("classes").get_shape()[0])
 
 
 @dataclass(frozen=True, eq=False)
 class LitPerson:
-    """A person under the light of a photo, and under T lights of a rig."""
+    """Person under the light of a photo, and under T lights of a rig."""
 
     images: Tensor  # [1 + T, 3, S, S]
     albedo: Tensor  # [3, S, S], or what stands for it
-    normals: Tensor | None  # [3, S, S]; None where nobody knows them
+    normals: Tensor | None  # [3, S, S]; None if unknown
     shares: Tensor  # [C, S, S] of the classes
     behind: Tensor  # [S, S], the share of what lies behind the person
     rig: Tensor  # [L, 3]
@@ -179,7 +166,7 @@ class LitPerson:
 def sample_of(
     lit: LitPerson, seen: dict[str, Tensor], backgrounds: Tensor, generator: torch.Generator
 ) -> PortraitSample:
-    """Photograph a person before a background; `seen` are the layers of `transport.layers_of`.
+    """Photograph a person in front of a background; `seen` are the layers of `proxies.layers_of`.
 
     Where `seen` has the visibility of a rig all around as `around`, with directions `around_directions`, the
     person's own rig need not lie all around.
@@ -245,7 +232,7 @@ def draw_targets(rig: Tensor, count: int, generator: torch.Generator) -> Tensor:
 
 def source_light(rig: Tensor, generator: torch.Generator) -> Tensor:
     """Draw weights [L, 3] of the photo's light."""
-    return draw_photo_light(rig, generator, _LAMP)
+    return draw_photo_light(rig, generator, _KEY_LIGHT)
 
 
 def _mean_over(image: Tensor, weight: Tensor) -> Tensor:

@@ -34,16 +34,14 @@ def portraits(tmp_path_factory: Folders) -> StoredPortraits:
     for person in range(2):
         label = torch.where(disc, class_index("skin"), class_index("garment")).byte()
         picture = torch.where(disc, 200, 60)[None] * torch.ones(3, 1, 1) * (disc | garment)
-        save_file(
-            {
-                "pictures": picture.byte().expand(2, 3, 3, STORED, STORED).contiguous(),
-                "alpha": (255 * (disc | garment)).byte().expand(2, STORED, STORED).contiguous(),
-                "label": label.expand(2, STORED, STORED).contiguous(),
-                "landmarks_px": ring.expand(2, -1, 2).contiguous(),
-                "rotation": torch.eye(3).expand(2, 3, 3).contiguous(),
-            },
-            folder / f"{person:05}.safetensors",
-        )
+        for camera in range(2):
+            photo = {
+                "images": picture.byte().expand(3, 3, STORED, STORED).contiguous(),
+                "alpha": (255 * (disc | garment)).byte(),
+                "label": label,
+                "landmarks_px": ring,
+            }
+            save_file(photo, folder / f"photo_{person:05}_{camera}.safetensors")
     backgrounds = torch.randint(0, 60, (3, 3, 32, 32), generator=torch.Generator().manual_seed(0)).byte()
     return StoredPortraits(folder, backgrounds, {"licence": "MIT"})
 
@@ -66,7 +64,7 @@ def test_a_draw_is_a_function_of_its_generator_and_an_empty_folder_none(
         one, two = drawn(portraits, seed), drawn(portraits, seed)
         assert all(torch.equal(getattr(one, name), getattr(two, name)) for name in vars(one))
         assert one.crops.min() >= 0 and one.crops.max() <= 1 and one.crops.isfinite().all()
-    refused(InputError, "no portraits", StoredPortraits, tmp_path, torch.zeros(1, 3, 8, 8).byte(), {})
+    refused(InputError, "no photos", StoredPortraits, tmp_path, torch.zeros(1, 3, 8, 8).byte(), {})
 
 
 @pytest.mark.usefixtures("plain")
