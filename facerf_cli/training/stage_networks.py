@@ -36,7 +36,6 @@ class PresetSizes:
 
     heads: int = 240
     views: int = 8
-    images: int = 24  # of each head, for the Geometry Network
     texture_side: int = 128  # of a dataset's textures
     joint_side: int = 256  # of the stage joint's crops and textures
     held_out_heads: int = 12
@@ -46,7 +45,7 @@ class PresetSizes:
 _SIZES: dict[Preset, PresetSizes] = {
     "default": PresetSizes(),
     "paper": PresetSizes(texture_side=512, joint_side=512, light_width=1.0),
-    "tiny": PresetSizes(heads=16, views=2, images=2, joint_side=64, held_out_heads=4, light_width=0.05),
+    "tiny": PresetSizes(heads=16, views=2, joint_side=64, held_out_heads=4, light_width=0.05),
 }
 
 

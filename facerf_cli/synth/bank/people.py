@@ -72,7 +72,7 @@ class PeopleBankSettings:
     with_squares: bool = True  # without them the photos are the same
 
 
-TINY_BANK = PeopleBankSettings(cameras=1, squares=1, images=1, looks=1, lights=12, side_px=128, photo_px=128)
+TINY_BANK = PeopleBankSettings(cameras=1, squares=1, images=1, looks=1, lights=12, side_px=96, photo_px=128)
 
 
 def add_people(
