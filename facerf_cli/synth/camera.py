@@ -41,10 +41,10 @@ class SimulatedCamera:
     jpeg: float = 0.0  # fraction of photos that are compressed
 
     def colours(self, generator: torch.Generator) -> Tensor:
-        """Draw the matrix [3, 3] from true colours to the camera's, as rows."""
+        """Draw the matrix [3, 3] from true colours to the camera's."""
         balance = torch.exp(Uniform(generator)(-self.balance, self.balance, 3))
         grey = torch.rand((), generator=generator) < self.grey
-        return balance[:, None].expand(3, 3) / 3 if grey else balance.diag()
+        return (balance / 3).expand(3, 3) if grey else balance.diag()
 
     def take(self, image: Tensor, mean: Tensor, generator: torch.Generator) -> Tensor:
         """Photograph a linear image [3, S, S], exposed by a mean radiance; return linear values in 0..1."""
@@ -69,7 +69,7 @@ class SimulatedCamera:
 
 def recoloured(images: Tensor, colours: Tensor) -> Tensor:
     """Apply matrices [..., 3, 3] of `SimulatedCamera.colours` to images [..., 3, H, W]."""
-    return torch.einsum("...chw,...cd->...dhw", images, colours)
+    return torch.einsum("...dc,...chw->...dhw", colours, images)
 
 
 def _sharpened(image: Tensor, uniform: Uniform) -> Tensor:

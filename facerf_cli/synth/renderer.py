@@ -231,7 +231,7 @@ def images_under(
     them, have highlights.
     """
     shading = _Shading(view, surface, highlights)
-    return torch.cat([shading.images(some) for some in weights.split(_AT_ONCE)])
+    return torch.cat([shading.images(some) for some in torch.split(weights, _AT_ONCE)])
 
 
 class _Shading:
@@ -260,8 +260,8 @@ class _Shading:
         view = self.view
         columns = weights.transpose(0, 1).flatten(1)  # [L, M * 3]
         bounced = (view.bounce @ (self.basis.T @ columns)).clamp_min(0)
-        irradiance = (self.diffuse @ columns).unflatten(1, (-1, 3))
-        irradiance = irradiance + self.surface.albedo.mean(0) * bounced.unflatten(1, (-1, 3))
+        irradiance = (self.diffuse @ columns).view(len(view.part), -1, 3)
+        irradiance = irradiance + self.surface.albedo.mean(0) * bounced.view(irradiance.shape)
         for channel, kernels in enumerate(self.kernels):
             on_skin = irradiance[self.skin, :, channel].numpy()
             for kernel in kernels:

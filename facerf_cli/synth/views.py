@@ -121,7 +121,7 @@ def facets_of(
     surface = sample(appearance, torch.from_numpy(part), samples.interpolate(head.uv))
     smooth = unit_along(samples.interpolate(head.normals), 1)
     along_u, along_v = _uv_tangents(head, samples, smooth)
-    slopes_u, slopes_v = surface.relief.split(1, 1)
+    slopes_u, slopes_v = torch.split(surface.relief, 1, 1)
     bent = groups.mean(unit_along(smooth - slopes_u * along_u - slopes_v * along_v, 1))
     length = bent.norm(dim=1).clamp(1e-3, 1)
     camera_head = -camera.head_to_camera.T.float() @ camera.translation_m.float()

@@ -83,7 +83,7 @@ def test_the_pose_follows_every_move_of_the_crop(objective):
     """The fit to the moved landmarks is the stored fit, moved: mirror, turn, scale and shift are right."""
     batch = draw(objective, 12)
     fit = fit_batch(load_face_model(), batch.landmarks_px, crop_camera(64))
-    assert (fit.rotation.float() - batch.rotation).flatten(1).norm(dim=1).max() < 0.05  # 2 degrees
+    assert (fit.rotation.float() - batch.rotation).flatten(1).norm(dim=1).max() < 0.06  # 2.5 degrees
     assert (fit.translation_m.float() - batch.translation_m).abs().max() < 0.012
     assert (fit.beta.float() - batch.beta).abs().max() < 0.3 < fit.beta.abs().max()
 
