@@ -6,7 +6,7 @@ shades them in a few hundredths of a second.
 
 Light spreads under the skin in the image: the irradiance of a pixel is a mean over near pixels of skin,
 weighted by a Gaussian in the distance of their surfaces (after Jimenez et al., *Screen-space perceptual
-rendering of human skin*, 2009).
+rendering of human skin*, 2009). Lenses of glasses lie over the finished image, without refraction.
 """
 
 import math
@@ -16,6 +16,7 @@ from typing import Self
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from scipy.sparse import csr_matrix
 from torch import Tensor
 
@@ -25,10 +26,10 @@ from facerf_cli.light.sh import sh_basis
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.portrait.parse import MORE_LANDMARKS
 from facerf_cli.raster.camera import project
+from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.synth.appearance.materials import Appearance, sample
 from facerf_cli.synth.head.body import clearance_m
-from facerf_cli.synth.head.mesh import PARTS
-from facerf_cli.synth.lenses import Lenses, lenses_in, reflections
+from facerf_cli.synth.head.mesh import PARTS, HeadMesh
 from facerf_cli.synth.shading import (
     Material,
     Strands,
@@ -48,6 +49,9 @@ _RELIEF_SOFTNESS = 0.15  # stands for light from all sides, which keeps bumps fr
 _SCATTER_REACH, _SCATTER_MOST_PX = 2.5, 16  # of the kernel: in sigmas, and at most in pixels
 _LEAST_SIGMA_PX = 0.25  # light that spreads less than this is not blurred
 _AT_ONCE = 16  # images shaded together
+_REFLECTANCE = 0.04  # of one surface of a lens at normal incidence: a refractive index of 1.5
+_SURFACES = 2  # of a lens
+_SHARPNESS = 150.0  # of the lobe that spreads a light over its surroundings
 _SKIN, _HAIR = PARTS.index("skin"), PARTS.index("hair")
 _MISSING = (math.nan,) * 3
 _IN_BYTES, _IN_HALVES = ("direct", "classes"), ("share", "normals", "bent", "tangents", "spread", "bounce")
@@ -104,6 +108,44 @@ def light_of(subject: Subject, transport: MeshTransport) -> PersonLight:
     bounced = transport.gathered(radiosity + albedo * bounced)
     direct[hair.numpy()] = transport.visibility.T[hair.numpy()]  # the cosine of strands varies in a facet
     return PersonLight(transport.directions, direct, bounced[transport.site_of] * transport.baked[:, None])
+
+
+@dataclass(frozen=True, eq=False)
+class Lenses:
+    """Lenses in pixels [N] of an image [S, S], numbered row by row; their normals and views [N, 3]."""
+
+    pixels: Tensor
+    normals: Tensor
+    views: Tensor
+
+
+def lenses_in(lenses: HeadMesh | None, camera: StageCamera, depth_m: np.ndarray) -> Lenses:
+    """Find the pixels that show lenses in front of everything else, of depth [H, W] in m, 0 for nothing."""
+    if lenses is None:
+        return Lenses(torch.zeros(0, dtype=torch.long), torch.zeros(0, 3), torch.zeros(0, 3))
+    vertices = camera.to_camera(torch.from_numpy(lenses.vertices))
+    triangles = torch.from_numpy(lenses.triangles)
+    fragments = rasterize(vertices, triangles, camera.camera)
+    normals = torch.from_numpy(lenses.normals) @ camera.head_to_camera.T
+    surface = interpolate(torch.cat([vertices, normals], 1), triangles, fragments)
+    unobstructed = torch.from_numpy(depth_m == 0) | (-surface[..., 2] < torch.from_numpy(depth_m))
+    pixels = (fragments.covered & unobstructed).flatten().nonzero()[:, 0]
+    position, normal = torch.split(surface.flatten(0, 1)[pixels], 3, 1)
+    return Lenses(pixels, F.normalize(normal, dim=1), F.normalize(-position, dim=1))
+
+
+def reflections(lenses: Lenses, directions: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the radiance [N, L] of each light of a rig in the lenses, and their transmittance [N].
+
+    A light of weight 1 stands for a cell of the sphere with a radiance of pi over its solid angle
+    (docs/design.md, 'Units of light').
+    """
+    cosine = (lenses.normals * lenses.views).sum(1)
+    mirrored = 2 * cosine[:, None] * lenses.normals - lenses.views
+    weights = (_SHARPNESS * mirrored @ directions.T).softmax(1)
+    fresnel = _REFLECTANCE + (1 - _REFLECTANCE) * (1 - cosine.abs().clamp(0, 1)) ** 5
+    reflected = _SURFACES * fresnel / (1 + fresnel)
+    return reflected[:, None] * weights * (len(directions) / 4), 1 - reflected
 
 
 @dataclass(frozen=True, eq=False)

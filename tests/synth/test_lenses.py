@@ -7,7 +7,7 @@ import torch
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.raster.camera import Camera
 from facerf_cli.synth.head.mesh import HeadMesh, strandless
-from facerf_cli.synth.lenses import Lenses, lenses_in, reflections
+from facerf_cli.synth.renderer import Lenses, lenses_in, reflections
 from facerf_cli.synth.views import StageCamera
 
 RIG = rig_directions(150)
