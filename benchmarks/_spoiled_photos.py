@@ -18,7 +18,8 @@ from facerf_cli.image.strips import resized
 from facerf_cli.portrait.find import Face, detect_faces
 from facerf_cli.portrait.segment import segment
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
-from facerf_cli.synth.bank.portraits import BRIGHTEST, PortraitBankSettings, heaps_of, photos_of, views_of_map
+from facerf_cli.synth.bank.backgrounds import heaps_of, views_of_map
+from facerf_cli.synth.bank.people import BRIGHTEST, PeopleBankSettings, bake_person
 
 LONGEST_PX = 640  # of a photo
 SYNTHETIC = 10  # people
@@ -182,13 +183,14 @@ def photo_scene(image: np.ndarray, entry: dict[str, Any] | None) -> Scene:
 
 def synthetic_scene(number: int) -> Scene | None:
     """A synthetic person before a view of a sky or shapes; None where the head is not found."""
-    photo = photos_of("builtin", number, SEED, PortraitBankSettings(1, 1, 448))
-    alpha = photo["alpha"][0].numpy() / np.float32(255)
-    radiance = np.square(photo["pictures"][0, 0].permute(1, 2, 0).numpy() / 255) * BRIGHTEST * 0.25
+    settings = PeopleBankSettings(cameras=1, images=1, looks=1, with_squares=False)
+    (photo,) = bake_person(["builtin"], SEED, settings, number).values()
+    alpha = photo["alpha"].numpy() / np.float32(255)
+    radiance = np.square(photo["images"][0].permute(1, 2, 0).numpy() / 255) * BRIGHTEST * 0.25
     drawn_behind = views_of_map(number, SEED) if number % 3 else heaps_of(1, SEED + number)
     behind = resized(drawn_behind[0].permute(1, 2, 0).numpy().astype(np.float32), *alpha.shape)
     image = to_display(radiance + (1 - alpha[..., None]) * srgb_to_linear(behind / 255))
-    face = face_near(image, photo["landmarks_px"][0, :68].numpy().mean(0))
+    face = face_near(image, photo["landmarks_px"][:68].numpy().mean(0))
     edge = abs(alpha - 0.5) < 0.45
     return face and Scene(image, alpha > 0.5, edge, face.landmarks_px)
 

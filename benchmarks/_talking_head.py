@@ -18,7 +18,7 @@ from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import pose_to_rotation, project
 from facerf_cli.raster.texture import vertex_normals
 from facerf_cli.synth.bank.heads import cached_face_model
-from facerf_cli.synth.portraits import bake_subject, images_under, materials_of, view_of
+from facerf_cli.synth.renderer import bake_light, images_under, view_of
 from facerf_cli.synth.subjects import Subject, draw_subject
 from facerf_cli.synth.views import StageCamera, stage_cameras, surface_samples
 
@@ -225,8 +225,9 @@ def draw_clip(person: int, frames: int, size_px: int) -> Clip:
     images, alphas = [], []
     for one in people:
         seen = seen_from(rig_directions(LIGHTS), one.camera)
-        baked = view_of(one.subject, bake_subject(one.subject, [one.camera], seen, BAKE, 0), one.camera)
-        surface = materials_of(baked, one.subject.appearance)
+        baked, surface = view_of(
+            one.subject, bake_light(one.subject, [one.camera], seen, BAKE, 0), one.camera
+        )
         images.append(images_under(baked, surface, torch.stack([SOURCE, TARGET])).permute(0, 2, 3, 1).numpy())
         alphas.append(baked.alpha.numpy())
     alpha = np.stack(alphas)

@@ -1,8 +1,8 @@
 """The Geometry Network: its landmark error on images it was not trained on.
 
-    python benchmarks/geometry_network.py [PHOTO|DIR ...] [--crops RUN/bank/pictures] [--dataset DATASET]
+    python benchmarks/geometry_network.py [PHOTO|DIR ...] [--crops RUN/bank/people] [--dataset DATASET]
 
-- `--crops`: held-out heads of a bank (`facerf train --stage geometry`), true landmarks with added noise.
+- `--crops`: held-out people of a bank (`facerf train --stage geometry`), true landmarks with added noise.
 - `--dataset`: its people under every tenth light together, against the landmarks of its fits.
 - Photos: against the landmarks that are found in them.
 
@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from _common import arguments, photos, required
+from safetensors.torch import load_file
 from torch import Tensor
 
 from facerf_cli.dataset.dataset import read_dataset
@@ -41,7 +42,7 @@ def main() -> None:
     parser = arguments(__doc__)
     parser.add_argument("photos", type=Path, nargs="*", help="photos, or folders of them")
     parser.add_argument("--checkpoint", type=Path, help="default: the shipped one")
-    parser.add_argument("--crops", type=Path, help="folder of the bank's rendered heads")
+    parser.add_argument("--crops", type=Path, help="folder of the bank's people")
     parser.add_argument("--held-out", type=int, default=12, help="heads of the bank that were not trained on")
     parser.add_argument("--draws", type=int, default=16, help="of each held-out head")
     parser.add_argument("--dataset", type=Path, help="of prepare-dataset")
@@ -96,7 +97,8 @@ def of_photos(paths: list[Path]) -> tuple[Tensor, Tensor]:
 def held_out(network: GeometryNetwork, folder: Path, count: int, draws: int) -> tuple[Tensor, Tensor]:
     """Print the errors on held-out heads of a bank; their crops, and their landmarks with noise."""
     settings = GeometryObjectiveSettings(held_out_heads=count, held_out_draws=draws)
-    objective = GeometryObjective(RenderedFaces(folder, {}), network, settings)
+    backgrounds = load_file(folder.parent / "backgrounds.safetensors")["backgrounds"]
+    objective = GeometryObjective(RenderedFaces(folder, backgrounds, {}), network, settings)
     metrics = objective.validate().metrics
     print(
         "held-out heads, true landmarks:", ", ".join(f"{key} {value:.2f}" for key, value in metrics.items())

@@ -43,8 +43,8 @@ from facerf_cli.portrait.parse import CLASSES
 from facerf_cli.portrait.segment import segment
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
+from facerf_cli.synth.bank.backgrounds import heaps_of, views_of_map
 from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
-from facerf_cli.synth.bank.portraits import heaps_of, views_of_map
 from facerf_cli.training.objective import seeded
 
 SEED = 7
@@ -235,7 +235,7 @@ def measure_held_out(folder: Path) -> None:
     portraits = _held_out(folder)
     network, counts = SHIPPED_NETWORKS.parsing, np.zeros((len(CLASSES), 3))
     matte_errors, error_percent = [], []
-    for person in range(len(portraits.paths)):
+    for person in range(len(portraits.photos)):
         for draw in range(8):
             crop = portraits.draw([person], network.side, seeded(SEED, person, draw))
             with torch.inference_mode():
@@ -274,7 +274,7 @@ def measure_segment(folder: Path) -> None:
     """Print errors of the matte of `segment` on photos of held-out synthetic people whose faces are whole."""
     portraits = _held_out(folder)
     errors = []
-    for person in range(len(portraits.paths)):
+    for person in range(len(portraits.photos)):
         for draw in range(5):
             crop = portraits.draw([person], SEGMENT_PX, seeded(SEED, person, draw))
             if not (crop.present[0] and crop.known[0, :68].all()):

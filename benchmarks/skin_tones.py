@@ -27,7 +27,7 @@ from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.synth.appearance.materials import draw_appearance
 from facerf_cli.synth.bank.portrait_samples import StoredView, load_view
 from facerf_cli.synth.bank.texture_samples import draw_light
-from facerf_cli.synth.portraits import albedo_of, images_under, materials_of
+from facerf_cli.synth.renderer import albedo_of, images_under, materials_of
 from facerf_cli.synth.shading import Material
 from facerf_cli.training.objective import seeded
 
@@ -44,7 +44,7 @@ def main() -> None:
     parser.add_argument("--drawn", type=int, default=24)
     options = parser.parse_args()
     bank = required(options.bank, "a bank of portraits", "--bank")
-    view = load_view(min((bank / "transport").glob("[0-9]*_0.safetensors")))
+    view = load_view(min((bank / "people").glob("[0-9]*_0.safetensors")))
     models = load_models()
     looks = [
         materials_of(view.portrait, draw_appearance(LOOK_PX, seeded(SEED, number)))
@@ -69,7 +69,7 @@ def main() -> None:
 
 def skin_of(view: StoredView) -> np.ndarray:
     """True where the person's skin is seen [S, S]."""
-    return np.asarray(view.portrait.classes.numpy()[..., class_index("skin")] > 127)
+    return np.asarray(view.portrait.classes.numpy()[..., class_index("skin")] > 0.5)
 
 
 def albedo_of_skin(view: StoredView, look: Material) -> float:
@@ -87,7 +87,7 @@ def measured(
     lamp = torch.zeros_like(natural[:1])
     lamp[0, (rig @ azel_to_direction(*torch.tensor(LAMP_AZEL_DEG)).float()).argmax()] = 1
     source = images_under(view.portrait, look, natural[:1])[0]
-    wall = MEAN_RADIANCE / 2 * (1 - view.alpha)
+    wall = MEAN_RADIANCE / 2 * (1 - view.portrait.alpha)
     gain = GAIN / float(natural[0].sum(0).mean())
     photo = (gain * source + wall).permute(1, 2, 0).clamp(0, 1).numpy()
     person = fit(models, photo, white=None, face=find_faces(models.networks.people, photo, "the photo")[0])

@@ -3,14 +3,14 @@
     python benchmarks/transport.py [--face-model builtin|PATH] [--size 384] [--lights 12] [--images DIR]
 
 The scene is a diffuse head with a drawn appearance under point lights, seen from the front and from a side,
-in direct light alone and with one bounce. Both images are unwrapped to UV space. The error is the root mean
+in direct light only and with two bounces. Both images are unwrapped to UV space. The error is the root mean
 square over visible texels that lie more than two texels from the edge of a shadow, relative to the mean
 radiance of the lit ones in the path tracer's image; over all texels, and over the lit ones alone.
 """
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import _path_tracer as path_tracer
@@ -22,7 +22,7 @@ from scipy.ndimage import binary_dilation
 from torch import Tensor
 
 from facerf_cli.face.morphable import MorphableModel, load_face_model
-from facerf_cli.face.topology import grid_triangles
+from facerf_cli.face.topology import GRID, grid_triangles
 from facerf_cli.files.write import write_display
 from facerf_cli.light.mesh_transport import bake_mesh
 from facerf_cli.light.sphere import azel_to_direction
@@ -30,11 +30,11 @@ from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import Camera, pose_to_rotation
 from facerf_cli.raster.rasterize import rasterize
 from facerf_cli.raster.texture import unwrap
-from facerf_cli.synth import renderer
 from facerf_cli.synth.appearance.materials import Appearance, draw_appearance
 from facerf_cli.synth.head.mesh import HeadMesh
 from facerf_cli.synth.head.shell import shell_head
-from facerf_cli.synth.renderer import RenderSettings
+from facerf_cli.synth.renderer import images_under, light_of, view_of
+from facerf_cli.synth.subjects import Subject
 from facerf_cli.synth.views import StageCamera
 
 DISTANCE_M, FIELD_M = 1.5, 0.24  # of the cameras, and the width that an image shows
@@ -78,9 +78,9 @@ def main() -> None:
     directions = np.stack([azel_to_direction(*map(float, angle)).numpy() for angle in angles])
     cameras = [stage_camera(given.size, yaw_deg) for yaw_deg in (0.0, 40.0)]
     results: dict[int, Comparison] = {}
-    times: dict[str, list[float]] = {"bake": [], "irradiance": [], "photograph": [], "mitsuba": []}
+    times: dict[str, list[float]] = {"bake": [], "photograph": [], "mitsuba": []}
     direct: list[Tensor] = []  # the path tracer's images without bounces
-    for bounces in (0, 1):
+    for bounces in (0, 2):
         settings = PathSettings(samples=given.samples, bounces=bounces, gloss=False, relief=False)
         ours, theirs = render_both(model, alpha, appearance, directions, cameras, settings, given.seed, times)
         direct = direct or theirs
@@ -93,17 +93,17 @@ def main() -> None:
 
 
 def print_errors(results: dict[int, Comparison], angles: Sequence[tuple[int, int]]) -> None:
-    """Print the errors of each light without and with a bounce."""
-    print_header("azimuth, elevation", "direct", "of lit texels", "one bounce", "of lit texels", "radiance")
+    """Print the errors of each light without and with bounces."""
+    print_header("azimuth, elevation", "direct", "of lit texels", "two bounces", "of lit texels", "radiance")
     for light, name in enumerate([*(f"{a}, {e}" for a, e in angles), "all lights"]):
-        percents = [f"{e[light]:.1%}" for n in (0, 1) for e in (results[n].errors, results[n].errors_lit)]
-        print_row(name, *percents, f"{results[1].means[light]:.4f}")
+        percents = [f"{e[light]:.1%}" for n in (0, 2) for e in (results[n].errors, results[n].errors_lit)]
+        print_row(name, *percents, f"{results[2].means[light]:.4f}")
 
 
 def print_times(times: dict[str, list[float]], lights: int) -> None:
     """Print the times of both renderers, and the ratio for an image."""
     mean_s = {name: float(np.mean(values)) for name, values in times.items()}
-    print(f"bake of {lights} lights {mean_s['bake']:.2f} s, their irradiance {mean_s['irradiance']:.2f} s")
+    print(f"bake of {lights} lights {mean_s['bake']:.2f} s")
     print(
         f"an image: bake {1000 * mean_s['photograph']:.0f} ms, mitsuba {1000 * mean_s['mitsuba']:.0f} ms, "
         f"{mean_s['mitsuba'] / mean_s['photograph']:.1f} times as long"
@@ -133,15 +133,15 @@ def render_both(
     bake = BakeSettings(light_radius_deg=0, bounce_samples=64 if settings.bounces else 0)
     started = time.perf_counter()
     transport = bake_mesh(head.vertices, head.normals, head.triangles, directions, bake, seed, wanted)
+    flat = {name: replace(part, relief=0 * part.relief) for name, part in appearance.materials.items()}
+    person = Appearance(flat, torch.zeros(3), {})
+    subject = Subject(head, person, torch.eye(3), torch.zeros(GRID * GRID, 3), np.zeros((68, 3)), {}, {})
+    light = light_of(subject, transport)
     times["bake"].append(time.perf_counter() - started)
-    plain = RenderSettings(bounces=settings.bounces, scattering=False, gloss=False, relief=False)
-    started = time.perf_counter()
-    irradiance = renderer.scattered_irradiance(head, appearance, transport, plain)
-    times["irradiance"].append(time.perf_counter() - started)
-    ours, theirs = [], []
+    ours, theirs, single = [], [], torch.eye(len(directions))[..., None].expand(-1, -1, 3)
     for camera in cameras:
         started = time.perf_counter()
-        ours.append(renderer.photograph(head, appearance, transport, camera, plain, irradiance=irradiance)[0])
+        ours.append(images_under(*view_of(subject, light, camera), single, highlights=0))
         times["photograph"].append((time.perf_counter() - started) / len(directions))
         started = time.perf_counter()
         theirs.append(path_tracer.photograph(head, appearance, directions, camera, settings, seed)[0])

@@ -15,7 +15,7 @@ from safetensors.torch import save_file
 
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.light_files import read_map_file
-from facerf_cli.synth.bank.portraits import BACKGROUND_HEAPS, BACKGROUND_MAPS, load_backgrounds, views_of
+from facerf_cli.synth.bank.backgrounds import BACKGROUND_HEAPS, BACKGROUND_MAPS, load_backgrounds, views_of
 
 VIEWS = 16  # of each map
 SEED = 15

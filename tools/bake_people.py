@@ -21,8 +21,9 @@ from torch import Tensor
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.run.workers import one_thread
 from facerf_cli.synth.bank import file_of
-from facerf_cli.synth.bank.portraits import BACKGROUND_HEAPS, BACKGROUND_MAPS, load_backgrounds
-from facerf_cli.synth.bank.transport import TransportBankSettings, look_at_photos, transport_of
+from facerf_cli.synth.bank.backgrounds import BACKGROUND_HEAPS, BACKGROUND_MAPS, load_backgrounds
+from facerf_cli.synth.bank.people import PeopleBankSettings, bake_person
+from facerf_cli.synth.bank.proxies import look_at_photos
 
 
 def bake(folder: Path, models: list[str], backgrounds: Tensor, until: float, number: int) -> int | None:
@@ -30,7 +31,7 @@ def bake(folder: Path, models: list[str], backgrounds: Tensor, until: float, num
     if time.time() > until:
         return None
     with one_thread():
-        made = transport_of(models[number % len(models)], number, 0, TransportBankSettings())
+        made = bake_person(models, 0, PeopleBankSettings(), number)
         for name, tensors in made.items():
             save_file(tensors, file_of(folder, name))
     look_at_photos(backgrounds, SHIPPED_NETWORKS, 0, sorted(folder.glob(f"photo_{number:05d}_*.safetensors")))
@@ -65,7 +66,7 @@ def main() -> None:
     parser.add_argument("--heads-from", default="builtin", help="face models, separated by commas")
     options = parser.parse_args()
     until = time.time() + options.seconds
-    folder = options.bank / "transport"
+    folder = options.bank / "people"
     folder.mkdir(parents=True, exist_ok=True)
     maps = load_backgrounds(options.bank / "backgrounds.safetensors", BACKGROUND_MAPS, BACKGROUND_HEAPS, 0)
     pool = ProcessPoolExecutor(options.jobs, get_context("fork"))

@@ -41,8 +41,8 @@ from facerf_cli.synth.bank.portrait_samples import (
     sample_of,
     source_light,
 )
+from facerf_cli.synth.bank.proxies import layers_of, person_in
 from facerf_cli.synth.bank.texture_samples import draw_target_lights
-from facerf_cli.synth.bank.transport import layers_of, person_in
 
 _AROUND = 48  # lights from all directions whose shadows are summarised, as for photos
 log = logging.getLogger(LOGGER_NAME)

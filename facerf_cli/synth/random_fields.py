@@ -35,7 +35,6 @@ class Uniform:
     shape: tuple[int, ...] = ()
 
     def __call__(self, low: float, high: float, *shape: int) -> Tensor:
-        """Draw numbers between `low` and `high`."""
         return low + (high - low) * torch.rand(shape or self.shape, generator=self.generator)
 
 

@@ -16,17 +16,14 @@ from facerf_cli.network.inputs import Batch
 LOBES = ((1.0, 0.75), (0.55, 0.25))  # skin: (roughness factor, weight) of a broad and of a narrow, oily lobe
 _NORMAL_VARIANCE = 0.18  # largest addition to alpha squared where normals vary within a facet
 _SCATTER_REACH = 6  # texels of the kernel on each side
-_STRAND_LOBES = (
-    (-0.12, 1.0),
-    (0.17, 2.0),
-    (0.06, 0.7),
-)  # hair, R, TRT and TT: (shift to the tip in radians, width factor)
+# Lobes R, TRT and TT of hair: shift to the tip in radians, and factor of the width.
+_STRAND_LOBES = ((-0.12, 1.0), (0.17, 2.0), (0.06, 0.7))
 _TRANSMITTED, _TRANSMITTED_WIDTH = 0.5, 0.45  # of TT: strength, standard deviation around the strand
 
 
 @dataclass(frozen=True)
 class Material(Batch):
-    """A surface as textures [C, H, W] with row v = 0 at the top, or at N points [N, C] ([N] if C is 1).
+    """Surface as textures [C, H, W] with row v = 0 at the top, or at N points [N, C] ([N] if C is 1).
 
     albedo [3, H, W] linear Rec.709; specular [1, H, W] reflectance at normal incidence; roughness [1, H, W]
     (GGX alpha is its square); relief [2, H, W] slopes of fine relief along +u and +v.
@@ -44,7 +41,7 @@ class Material(Batch):
 
 @dataclass(frozen=True)
 class Skin(Material):
-    """Textures [B, C, T, T] of B faces; scattering_texels [B, 3]: see `scatter`."""
+    """Material of B faces as textures [B, C, T, T]; scattering_texels [B, 3]: see `scatter`."""
 
     scattering_texels: Tensor
 
@@ -141,7 +138,7 @@ def _smith(cosine: Tensor, alpha_squared: Tensor) -> Tensor:
 
 
 def strand_cosines(tangents: Tensor, normals: Tensor, lights: Tensor) -> Tensor:
-    """Compute the diffuse factor of hair [N, L], which takes the place of n.l.
+    """Compute the diffuse factor of hair [N, L], which replaces n.l.
 
     It is the sine of Kajiya and Kay (*Rendering fur*, 1989), wrapped by the normal of the hair volume as by
     Scheuermann (*Hair rendering and shading*, 2004). tangents and normals [N, 3] and lights [L, 3] are unit.
@@ -178,7 +175,7 @@ def strand_highlights(hair: Strands, lights: Tensor) -> tuple[Tensor, Tensor]:
     fresnel = hair.specular[:, None] + (1 - hair.specular[:, None]) * (1 - incidence) ** 5
     around = math.pi * cos_l * cos_half_phi / (4 * cos_difference**2)
     half, width = (theta_l + theta_v) / 2, (hair.roughness[:, None] ** 2).clamp_min(0.06)
-    # Half a Gaussian: the half angle changes half as fast as the angle over which a lobe integrates to 1.
+    # Half a Gaussian: the half angle changes half as fast as the angle that a lobe integrates to 1 over.
     white, coloured, through = (
         _gaussian(half - shift, width * spread) / 2 for shift, spread in _STRAND_LOBES
     )

@@ -1,4 +1,4 @@
-"""A synthetic light stage: random subjects, photographed by every camera under every light into a capture."""
+"""Synthetic light stage: random subjects, photographed by every camera under every light into a capture."""
 
 from collections.abc import Iterator
 from dataclasses import asdict, replace
@@ -19,15 +19,12 @@ from facerf_cli.files.write import write_exr
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE, Provenance
-from facerf_cli.synth import renderer
 from facerf_cli.synth.bank.heads import cached_face_model
-from facerf_cli.synth.head.mesh import HeadMesh
-from facerf_cli.synth.renderer import lenses_in, over_lenses
+from facerf_cli.synth.renderer import bake_light, images_under, view_of
 from facerf_cli.synth.stage_settings import StageSettings
 from facerf_cli.synth.subjects import Subject
-from facerf_cli.synth.views import CAMERA_DISTANCE_M, StageCamera, stage_cameras, truth_of
+from facerf_cli.synth.views import StageCamera, stage_cameras
 
-_LEAST_FACING = -0.2  # cosine to a camera below which a vertex is not baked
 _BAKE = BakeSettings()
 
 
@@ -84,11 +81,11 @@ def open_capture(folder: Path, settings: StageSettings) -> None:
     path, described = folder / STAGE_FILE, describe_stage(settings)
     if path.exists():
         try:
-            found = read_json(path, "")
+            stored = read_json(path, "")
         except InputError:
-            found = {}
-        if not isinstance(found, dict) or {**found, "subjects": None} != {**described, "subjects": None}:
-            raise UsageError(f"{path}: the capture has other settings; give another -o or remove it")
+            stored = {}
+        if not isinstance(stored, dict) or {**stored, "subjects": None} != {**described, "subjects": None}:
+            raise UsageError(f"{path}: the capture has other settings; use another -o or remove it")
         return
     write_document(path, described)
 
@@ -102,36 +99,11 @@ def close_capture(folder: Path, settings: StageSettings) -> None:
 
 def photograph_subject(subject: Subject, settings: StageSettings) -> Iterator[Tensor]:
     """Render linear images [L, 3, H, W], one camera at a time."""
-    directions, cameras = light_directions(settings), _cameras(settings)
-    mesh, appearance = subject.mesh, subject.appearance
-    wanted = _visible_vertices(mesh, cameras)
-    transport = renderer.bake_person(mesh, directions, _BAKE, settings.seed, wanted)
-    irradiance = renderer.scattered_irradiance(mesh, appearance, transport)
-
-    def photo(camera: StageCamera) -> Tensor:
-        images, _ = renderer.photograph(mesh, appearance, transport, camera, irradiance=irradiance)
-        return _with_lenses(images, subject, camera, directions)
-
-    return map(photo, cameras)
-
-
-def _with_lenses(images: Tensor, subject: Subject, camera: StageCamera, directions: np.ndarray) -> Tensor:
-    """Lay the lenses of a person's glasses over images [L, 3, H, W]."""
-    if subject.lenses is None:
-        return images
-    depth_m = -truth_of(subject.mesh, subject.appearance, camera).positions_m[..., 2]
-    in_camera = torch.from_numpy(directions).float() @ camera.head_to_camera.T.float()
-    return over_lenses(images, lenses_in(subject.lenses, camera, depth_m), in_camera)
-
-
-def _visible_vertices(mesh: HeadMesh, cameras: tuple[StageCamera, ...]) -> np.ndarray:
-    """Mask [V] of vertices that face a camera, or nearly."""
-    visible = np.zeros(len(mesh.vertices), bool)
+    cameras = _cameras(settings)
+    light = bake_light(subject, cameras, light_directions(settings), _BAKE, settings.seed)
+    single = torch.eye(settings.lights)[..., None].expand(-1, -1, 3)
     for camera in cameras:
-        rotation, translation = camera.head_to_camera.numpy(), camera.translation_m.numpy()
-        toward = -translation @ rotation - mesh.vertices
-        visible |= (mesh.normals * toward).sum(-1) > _LEAST_FACING * CAMERA_DISTANCE_M
-    return visible
+        yield images_under(*view_of(subject, light, camera), single)
 
 
 def write_subject(folder: Path, subject: Subject, settings: StageSettings) -> None:

@@ -16,8 +16,8 @@ class StageSettings:
     Attributes:
         size_px: Write square images of this side.
         face_model: Draw people from this face model: builtin, or a .npz of `face-model import`.
-        lights: Use so many lights, uniform on the sphere.
-        cameras: Use so many cameras, the first of eight: from the front, then ever more from the sides.
+        lights: Number of lights, uniform on the sphere.
+        cameras: Number of cameras, from the front first, then more and more from the sides.
         frame: Show the head down to the collar, or a bust down to the chest.
     """
 

@@ -31,7 +31,7 @@ _HELD, _HELD_SHARES, _EARRINGS_SHARE = ("none", "hand", "microphone"), (0.89, 0.
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A person in the stage: mesh in world space (m) and materials."""
+    """Person in the stage: mesh in world space (m) and materials."""
 
     mesh: HeadMesh
     appearance: Appearance
@@ -55,10 +55,11 @@ def draw_subject(model: MorphableModel, index: int, seed: int, size_px: int, arm
         beta = _eyes_closed(model, beta)
     gaze = random.normal(0, _GAZE_STD_DEG, 2)
     pose_deg = random.normal(0, _POSE_STD_DEG)
-    side = _canvas_side(size_px)
+    side = 512 if size_px <= 256 else 1024  # texels of the skin
+    subdivisions = 0 if size_px <= _SMALL_PX else 1 if size_px <= 384 else 2  # edges of about a pixel
     appearance = draw_appearance(side, generator)
     face_vertices = model.vertices(alpha[None], beta[None])[0]
-    bare = shell_head(face_vertices, (float(gaze[0]), float(gaze[1])), _subdivisions(size_px))
+    bare = shell_head(face_vertices, (float(gaze[0]), float(gaze[1])), subdivisions)
     landmarks_m = model.landmarks(face_vertices[None])[0].numpy()
     edge_m = _BODY_EDGE_M if size_px > _SMALL_PX else 3 * _BODY_EDGE_M
     dressed, garment = draw_body(bare, random, edge_m, arms)
@@ -118,16 +119,6 @@ def _worn(
         meshes.append(draw_earrings(lobes, random))
     traits = {"glasses": glasses, "held": held, "earrings": earrings}
     return meshes, drawn.lenses if drawn else None, traits
-
-
-def _canvas_side(size_px: int) -> int:
-    """Texels of the skin texture."""
-    return 512 if size_px <= 256 else 1024
-
-
-def _subdivisions(size_px: int) -> int:
-    """Number of subdivisions of the head mesh that make its edges about a pixel long."""
-    return 0 if size_px <= _SMALL_PX else 1 if size_px <= 384 else 2
 
 
 def _eyes_closed(model: MorphableModel, beta: Tensor) -> Tensor:

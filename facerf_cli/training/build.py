@@ -14,8 +14,9 @@ from facerf_cli.light.transport import BakeSettings
 from facerf_cli.network.checkpoint import form_of, new_network
 from facerf_cli.network.installed import installed
 from facerf_cli.relighting.models import Networks
+from facerf_cli.synth.bank.backgrounds import BACKGROUND_HEAPS, BACKGROUND_MAPS, load_backgrounds
 from facerf_cli.synth.bank.heads import HeadBakeSettings, add_views, bake_heads, load_bank
-from facerf_cli.synth.bank.portraits import BACKGROUND_HEAPS, BACKGROUND_MAPS, load_backgrounds
+from facerf_cli.synth.bank.people import TINY_BANK, PeopleBankSettings, add_people
 from facerf_cli.synth.bank.texture_samples import SampleSource
 from facerf_cli.synth.head.mesh import MAKEHUMAN_LICENCE
 from facerf_cli.training.losses import load_features
@@ -158,18 +159,24 @@ class Run:
             "licence": f"MIT; the heads' shapes: {drawn.licence}",
         }
 
-    def whole_people(self, held_out: int) -> tuple[range, list[str], dict[str, Any]]:
-        """Return numbers of synthetic people, the face models that they take turns in, and provenance."""
-        sizes, models = self.sizes, self.options.heads_from.split(",")
-        if sizes.heads <= held_out:
-            raise UsageError(f"--heads {sizes.heads}: {held_out} people are held out; use more")
+    def bake_people(self, held_out: int, with_squares: bool) -> tuple[Path, dict[str, Any]]:
+        """Bake the synthetic people that are missing; return their folder and their provenance.
+
+        The stage portrait needs the transport in the person's square (`with_squares`).
+        """
+        options, heads = self.options, self.sizes.heads
+        if heads <= held_out:
+            raise UsageError(f"--heads {heads}: {held_out} people are held out; use more")
+        folder, models = self.bank / "people", options.heads_from.split(",")
         drawn = [load_face_model(model) for model in models]
+        settings = TINY_BANK if self.is_tiny else PeopleBankSettings()
+        settings = replace(settings, with_squares=with_squares)
+        add_people(folder, models, range(heads), options.jobs, options.settings.seed, settings)
         shapes = [f"the heads' shapes: {model.licence}" for model in drawn]
-        provenance = {
+        return folder, {
             "heads": f"synthetic people drawn from {' and '.join(model.credit for model in drawn)}",
             "licence": "; ".join(["MIT", *shapes, MAKEHUMAN_LICENCE]),
         }
-        return range(sizes.heads), models, provenance
 
     def backgrounds(self, folder: Path) -> Tensor:
         """Load the backgrounds of photos; draw them if the folder lacks their file."""

@@ -18,7 +18,7 @@ from facerf_cli.face.topology import CONTOUR, OUTER_EYE_CORNERS
 from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometryNetworkSettings
 from facerf_cli.network.inputs import concatenate
 from facerf_cli.raster.camera import crop_camera, project
-from facerf_cli.synth.bank.face_crops import FaceCrops, RenderedFaces, add_head_images
+from facerf_cli.synth.bank.face_crops import FaceCrops, RenderedFaces
 from facerf_cli.training.build import Run
 from facerf_cli.training.objective import Objective, Validation
 from facerf_cli.training.sheets import FOUND_COLOUR, TRUE_COLOUR, in_rows, mark, tiled
@@ -154,12 +154,11 @@ class GeometryObjective(Objective):
 
 
 def build(run: Run) -> Objective:
-    """Make the objective of the stage; bake heads and render their images where they are missing."""
-    options, sizes, images = run.options, run.sizes, run.bank / "pictures"
-    provenance = run.bake_heads()
-    add_head_images(run.bank / "heads", images, sizes.images, options.jobs, options.settings.seed)
-    faces = RenderedFaces(images, provenance)
-    settings = GeometryObjectiveSettings(held_out_heads=sizes.held_out_heads)
+    """Make the objective of the stage; bake synthetic people that are missing."""
+    held_out = run.sizes.held_out_heads
+    folder, provenance = run.bake_people(held_out, with_squares=False)
+    faces = RenderedFaces(folder, run.backgrounds(run.bank), provenance)
+    settings = GeometryObjectiveSettings(held_out_heads=held_out)
     network = run.geometry(faces.mean_translation_m())
     objective: Objective = run.objective(GeometryObjective)(faces, network, settings)
     return objective

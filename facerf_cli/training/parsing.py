@@ -18,7 +18,6 @@ from facerf_cli.network.inputs import concatenate
 from facerf_cli.network.parsing import Parsing, ParsingNetwork
 from facerf_cli.portrait.parse import CLASSES
 from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
-from facerf_cli.synth.bank.portraits import PortraitBankSettings, add_portraits
 from facerf_cli.training.build import Run
 from facerf_cli.training.objective import Objective, Validation
 from facerf_cli.training.sheets import FOUND_COLOUR, TRUE_COLOUR, in_rows, mark, tiled
@@ -142,11 +141,9 @@ class ParsingObjective(Objective):
 
 
 def build(run: Run) -> Objective:
-    """Make the objective of the stage; photograph synthetic people whose photos are missing."""
-    options, folder, held_out = run.options, run.bank / "portraits", run.sizes.held_out_heads
-    people, models, provenance = run.whole_people(held_out)
-    bank = PortraitBankSettings(views=1, photos=1, side_px=96) if run.is_tiny else PortraitBankSettings()
-    add_portraits(folder, models, people, options.jobs, options.settings.seed, bank)
+    """Make the objective of the stage; bake synthetic people that are missing."""
+    held_out = run.sizes.held_out_heads
+    folder, provenance = run.bake_people(held_out, with_squares=False)
     stored = StoredPortraits(folder, run.backgrounds(run.bank), provenance)
     settings = ParsingObjectiveSettings(held_out_people=held_out)
     objective: Objective = run.objective(ParsingObjective)(stored, run.network("parsing"), settings)

@@ -23,7 +23,7 @@ from facerf_cli.synth.bank.portrait_samples import (
     PortraitSource,
     StoredTransport,
 )
-from facerf_cli.synth.bank.transport import TINY_BANK, TransportBankSettings, add_proxies, add_transport
+from facerf_cli.synth.bank.proxies import add_proxies
 from facerf_cli.training.build import Run
 from facerf_cli.training.objective import Objective, Validation, seeded
 from facerf_cli.training.sheets import tiled
@@ -208,10 +208,7 @@ def build(run: Run) -> Objective:
 
 def _stored_transport(run: Run, held_out: int) -> StoredTransport:
     """Open the bank of synthetic people; bake and analyse those that are missing."""
-    options, folder = run.options, run.bank / "transport"
-    people, models, provenance = run.whole_people(held_out)
-    settings, seed = TINY_BANK if run.is_tiny else TransportBankSettings(), options.settings.seed
-    add_transport(folder, models, people, options.jobs, seed, settings)
-    backgrounds = run.backgrounds(run.bank)
-    add_proxies(folder, backgrounds, run.people, options.jobs, seed)
+    options, backgrounds = run.options, run.backgrounds(run.bank)
+    folder, provenance = run.bake_people(held_out, with_squares=True)
+    add_proxies(folder, backgrounds, run.people, options.jobs, options.settings.seed)
     return StoredTransport(folder, backgrounds, provenance)

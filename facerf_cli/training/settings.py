@@ -167,7 +167,6 @@ class Sizes:
 
     heads: int = 240
     views: int = 8
-    images: int = 24  # of each head, for the Geometry Network
     texture_side: int = 128  # of a dataset's textures
     joint_side: int = 256  # of the stage joint's crops and textures
     held_out_heads: int = 12

@@ -16,13 +16,11 @@ from facerf_cli.light.mesh_transport import bake_mesh
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import Camera
-from facerf_cli.synth import renderer
 from facerf_cli.synth.appearance.materials import Appearance
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
-from facerf_cli.synth.renderer import RenderSettings
 from facerf_cli.synth.shading import Material
 from facerf_cli.synth.views import StageCamera
-from tests.synth.shapes import square
+from tests.synth.shapes import photograph, square, with_materials
 
 LIGHTS = np.array([[-0.48, 0.36, 0.8], [-0.6, 0.0, 0.8]], np.float32)  # they miss the wall
 CAMERA = StageCamera(Camera(400, 60, 40, 24.0, 25.0), torch.eye(3), torch.tensor([0.0, 0.0, -1.0]))
@@ -67,9 +65,9 @@ def _both(settings: PathSettings) -> tuple[torch.Tensor, torch.Tensor, torch.Ten
     head, person = _corner(), _appearance()
     bake = BakeSettings(light_radius_deg=0, bounce_samples=256 if settings.bounces else 0)
     transport = bake_mesh(head.vertices, head.normals, head.triangles, LIGHTS, bake)
-    ours = RenderSettings(settings.bounces, False, settings.gloss, settings.relief)
+    flat = person if settings.relief else with_materials(person, relief=0)
     return (
-        *renderer.photograph(head, person, transport, CAMERA, ours),
+        *photograph(head, flat, transport, CAMERA, highlights=24 if settings.gloss else 0),
         *path_tracer.photograph(head, person, LIGHTS, CAMERA, settings),
     )
 
@@ -90,8 +88,8 @@ def test_both_cameras_see_the_same_place_in_an_image_that_is_not_square() -> Non
     assert _relative_rms(ours, theirs, coverage) < 0.05
 
 
-def test_relief_and_one_bounce_are_the_same_in_both() -> None:
-    settings = PathSettings(samples=256, bounces=1, gloss=False, relief=False)
+def test_relief_and_bounces_are_the_same_in_both() -> None:
+    settings = PathSettings(samples=256, bounces=2, gloss=False, relief=False)
     ours, coverage, theirs, _ = _both(settings)
     assert _relative_rms(ours, theirs, coverage) < 0.05
     dark, _, _, _ = _both(replace(settings, bounces=0))
@@ -105,15 +103,10 @@ def test_relief_and_one_bounce_are_the_same_in_both() -> None:
 def test_highlights_are_the_same_in_both() -> None:
     glossy = PathSettings(samples=16, gloss_samples=128, bounces=0, gloss=True, relief=False)
     head, person = _corner(), _appearance()
-    black = Appearance(
-        {name: replace(part, albedo=0 * part.albedo) for name, part in person.materials.items()},
-        person.scattering_mm,
-        {},
-    )
+    black = with_materials(person, albedo=0)
     bake = BakeSettings(light_radius_deg=0, bounce_samples=0)
     transport = bake_mesh(head.vertices, head.normals, head.triangles, LIGHTS, bake)
-    plain = RenderSettings(0, False, True, False)
-    ours, coverage = renderer.photograph(head, black, transport, CAMERA, plain)
+    ours, coverage = photograph(head, with_materials(black, relief=0), transport, CAMERA)
     theirs, _ = path_tracer.photograph(head, black, LIGHTS, CAMERA, glossy)
     assert theirs[0].max() > 0.02
     assert _relative_rms(ours[:1], theirs[:1], coverage) < 0.15

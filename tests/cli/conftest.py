@@ -10,9 +10,9 @@ from facerf_cli.files.write import write_exr
 from facerf_cli.main import main
 from tests import astronaut
 from tests.cli.toy_checkpoint import save_toy_checkpoint
-from tests.synth.conftest import transport_folder
+from tests.synth.conftest import people_folder
 
-__all__ = ["transport_folder"]
+__all__ = ["people_folder"]
 
 
 @pytest.fixture(scope="session")

@@ -20,7 +20,7 @@ from facerf_cli.synth import stage
 from facerf_cli.synth.bank.heads import cached_face_model
 from facerf_cli.synth.stage_settings import Frame
 from facerf_cli.synth.subjects import draw_subject
-from facerf_cli.synth.views import stage_cameras, truth_of
+from facerf_cli.synth.views import layers_of, stage_cameras, surface_samples
 from tests.folders import tree
 
 LIGHTS, CAMERAS = 6, 3
@@ -112,7 +112,8 @@ def test_a_bust_shows_more_of_the_garment() -> None:
     subject = draw_subject(cached_face_model("builtin"), 0, 0, 64)
     frames: tuple[Frame, Frame] = ("head", "bust")
     head, bust = (
-        truth_of(subject.mesh, subject.appearance, stage_cameras(64, frame)[0]).classes for frame in frames
+        layers_of(subject.mesh, surface_samples(subject.mesh, camera), camera)[0]
+        for camera in (stage_cameras(64, frame)[0] for frame in frames)
     )
     garment, skin = class_index("garment"), class_index("skin")
     assert bust[..., garment].sum() > 2 * head[..., garment].sum()

@@ -19,7 +19,7 @@ from facerf_cli.network.files import SHIPPED
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.parse import LANDMARKS
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
-from facerf_cli.synth.bank.transport import seen_path
+from facerf_cli.synth.bank.proxies import seen_path
 from facerf_cli.training import run as training_run
 from facerf_cli.training.settings import Adadelta, Constant, PaperWeights, TrainSettings
 from tests.dataset.dataset_fixture import write_small_dataset
@@ -220,18 +220,18 @@ def require_served(tmp_path: Path, name: str, shipped: tuple[list[str], np.ndarr
 def test_the_parsing_network_trains_on_a_bank_of_portraits(
     tmp_path: Path, shipped: tuple[list[str], np.ndarray]
 ) -> None:
-    """Its people are made up here; `tests/synth/bank/test_portraits.py` has a real one."""
+    """Its people are made up here; `tests/synth/bank/test_people.py` has a real one."""
     bank = tmp_path / "bank"
-    (bank / "portraits").mkdir(parents=True)
+    (bank / "people").mkdir(parents=True)
     save_file({"backgrounds": torch.full((2, 3, 16, 16), 90).byte()}, bank / "backgrounds.safetensors")
     for person in range(5):
         person_of = {
-            "pictures": torch.full((1, 1, 3, 96, 96), 120).byte(),
-            "alpha": torch.full((1, 96, 96), 255).byte(),
-            "label": torch.ones(1, 96, 96).byte(),
-            "landmarks_px": 30 + 36 * torch.rand(1, LANDMARKS, 2),
+            "images": torch.full((1, 3, 96, 96), 120).byte(),
+            "alpha": torch.full((96, 96), 255).byte(),
+            "label": torch.ones(96, 96).byte(),
+            "landmarks_px": 30 + 36 * torch.rand(LANDMARKS, 2),
         }
-        save_file(person_of, bank / "portraits" / f"{person:05}.safetensors")
+        save_file(person_of, bank / "people" / f"photo_{person:05}_0.safetensors")
     line = ["train", "-o", str(tmp_path / "run"), "--stage", "parsing", "--preset", "tiny", "--heads", "5"]
     assert main([*line, "--bank", str(bank), "--steps", "5", "--workers", "0"]) == 0
     networks, metadata = load_networks(tmp_path / "run" / "last.safetensors", LAYOUT_VERSION)
@@ -241,15 +241,15 @@ def test_the_parsing_network_trains_on_a_bank_of_portraits(
 
 
 @pytest.mark.slow
-def test_the_portrait_network_trains_on_a_bank_of_transport(
-    transport_folder: Path, tmp_path: Path, shipped: tuple[list[str], np.ndarray]
+def test_the_portrait_network_trains_on_a_bank_of_people(
+    people_folder: Path, tmp_path: Path, shipped: tuple[list[str], np.ndarray]
 ) -> None:
     """One person, baked and seen, stands for five."""
-    bank, baked = tmp_path / "bank", transport_folder / "00001_0.safetensors"
-    (bank / "transport").mkdir(parents=True)
+    bank, baked = tmp_path / "bank", people_folder / "00001_0.safetensors"
+    (bank / "people").mkdir(parents=True)
     save_file({"backgrounds": torch.full((2, 3, 16, 16), 90).byte()}, bank / "backgrounds.safetensors")
     for person in range(5):
-        path = bank / "transport" / f"{person:05}_0.safetensors"
+        path = bank / "people" / f"{person:05}_0.safetensors"
         shutil.copy(baked, path)
         shutil.copy(seen_path(baked), seen_path(path))
     line = ["train", "-o", str(tmp_path / "run"), "--stage", "portrait", "--preset", "tiny", "--heads", "5"]

@@ -12,7 +12,8 @@ from facerf_cli.light.transport import BakeSettings
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth import bank as bank_room
 from facerf_cli.synth.bank.heads import Bank, HeadBakeSettings, add_views, bake_heads, load_bank
-from facerf_cli.synth.bank.transport import TransportBankSettings, look_at_photos, transport_of
+from facerf_cli.synth.bank.people import PeopleBankSettings, bake_person
+from facerf_cli.synth.bank.proxies import look_at_photos
 
 TINY = HeadBakeSettings(side=32, lights=20, bake=BakeSettings(light_samples=1, bounce_samples=2))
 
@@ -36,7 +37,7 @@ def bank(bank_folder: Path) -> Bank:
     )
 
 
-SMALL = TransportBankSettings(cameras=1, squares=2, looks=2, lights=14, side_px=192)
+SMALL = PeopleBankSettings(cameras=1, squares=2, images=3, looks=2, lights=14, side_px=192)
 
 
 def backgrounds() -> Tensor:
@@ -45,15 +46,15 @@ def backgrounds() -> Tensor:
 
 
 @pytest.fixture(scope="session")
-def transport_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def people_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bank of one person, whom two squares of a photo show; all processes of a run have the same."""
 
     def fill(folder: Path) -> None:
-        for name, tensors in transport_of("builtin", 1, 10, SMALL).items():
+        for name, tensors in bake_person(["builtin"], 10, SMALL, 1).items():
             save_file(tensors, folder / f"{name}.safetensors")
         look_at_photos(backgrounds(), SHIPPED_NETWORKS, 0, list(folder.glob("photo_*")))
 
-    return made_once(tmp_path_factory, "transport", fill)
+    return made_once(tmp_path_factory, "people", fill)
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, fill: Callable[[Path], None]) -> Path:

@@ -1,13 +1,19 @@
 """Simple bodies of one material, and a camera that looks at them."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 import trimesh
 
+from facerf_cli.face.topology import GRID
+from facerf_cli.light.mesh_transport import MeshTransport
 from facerf_cli.raster.camera import Camera, pose_to_rotation
 from facerf_cli.synth.appearance.materials import Appearance
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh, strandless
+from facerf_cli.synth.renderer import images_under, light_of, view_of
 from facerf_cli.synth.shading import Material
+from facerf_cli.synth.subjects import Subject
 from facerf_cli.synth.views import StageCamera
 
 
@@ -49,3 +55,26 @@ def camera(
     """A camera far away that shows a square of `field_m` around the origin."""
     lens = Camera(side_px * distance_m / field_m, side_px, side_px, side_px / 2, side_px / 2)
     return StageCamera(lens, pose_to_rotation(yaw_deg, 0, 0), torch.tensor([0.0, 0, -distance_m]))
+
+
+def with_materials(person: Appearance, **factors: float) -> Appearance:
+    """Return a person with fields of all materials multiplied by factors."""
+    materials = {
+        name: replace(part, **{field: factor * getattr(part, field) for field, factor in factors.items()})
+        for name, part in person.materials.items()
+    }
+    return replace(person, materials=materials)
+
+
+def subject_of(mesh: HeadMesh, person: Appearance) -> Subject:
+    return Subject(mesh, person, torch.eye(3), torch.zeros(GRID * GRID, 3), np.zeros((68, 3)), {}, {})
+
+
+def photograph(
+    mesh: HeadMesh, person: Appearance, transport: MeshTransport, camera: StageCamera, highlights: int = 12
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Render images [L, 3, S, S] in each light, and coverage [S, S]."""
+    subject = subject_of(mesh, person)
+    view, surface = view_of(subject, light_of(subject, transport), camera)
+    single = torch.eye(len(transport.directions))[..., None].expand(-1, -1, 3)
+    return images_under(view, surface, single, highlights), view.alpha

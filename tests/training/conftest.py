@@ -1,3 +1,3 @@
-from tests.synth.conftest import bank, bank_folder
+from tests.synth.conftest import bank, bank_folder, people_folder
 
-__all__ = ["bank", "bank_folder"]
+__all__ = ["bank", "bank_folder", "people_folder"]

@@ -11,28 +11,30 @@ from facerf_cli.face.fit import fit_batch
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometryNetworkSettings
 from facerf_cli.raster.camera import crop_camera
-from facerf_cli.synth.bank.face_crops import RenderedFaces, add_head_images
+from facerf_cli.synth.bank.face_crops import RenderedFaces
+from facerf_cli.synth.bank.people import read_photo
 from facerf_cli.training.geometry import GeometryObjective, GeometryObjectiveSettings
 from facerf_cli.training.objective import seeded
+from tests.kinds import Folders
 from tests.refusals import refused
+from tests.synth.conftest import backgrounds
 
 FEW = GeometryObjectiveSettings(held_out_heads=1, held_out_draws=4)
 
 
 @pytest.fixture(scope="module")
-def images(bank_folder: Path) -> Path:
-    """Two pictures of each of the first three heads of the test bank."""
-    heads = bank_folder / "three"
-    heads.mkdir()
-    for path in sorted((bank_folder / "heads").glob("*.safetensors"))[:3]:
-        (heads / path.name).symlink_to(path)
-    add_head_images(heads, bank_folder / "pictures", 2, jobs=1, seed=3)
-    return bank_folder / "pictures"
+def folder(people_folder: Path, tmp_path_factory: Folders) -> Path:
+    """Three people, who are one."""
+    folder = tmp_path_factory.mktemp("people")
+    for person in range(3):
+        path = folder / f"photo_{person:05}_0.safetensors"
+        path.symlink_to(people_folder / "photo_00001_0.safetensors")
+    return folder
 
 
 @pytest.fixture(scope="module")
-def faces(images: Path) -> RenderedFaces:
-    return RenderedFaces(images, {"licence": "MIT"})
+def faces(folder: Path) -> RenderedFaces:
+    return RenderedFaces(folder, backgrounds(), {"licence": "MIT"})
 
 
 @pytest.fixture
@@ -46,13 +48,12 @@ def draw(objective, count=4, seed=7):
 
 
 def test_images_show_a_face_and_the_paper_form_learns_from_them(faces):
-    image = faces.images[1]["pictures"][0]
-    cover = image[3].float() / 255
-    assert image.shape == (4, 160, 160) and 0.3 < cover.mean() < 0.95
-    inner = faces.images[1]["landmarks_px"][0, 27:36].long() + 16  # nose and its root: skin everywhere
-    assert cover[inner[:, 1], inner[:, 0]].min() == 1
-    lit = image[:3].float().mean(0)
-    assert lit[cover > 0].mean() > 10 and lit[cover == 0].max() == 0
+    face = faces.faces[1][0]
+    photo = read_photo(face.path, torch.Generator())
+    nose = face.points_px[27:36].long()
+    assert photo.alpha[nose[:, 1], nose[:, 0]].min() == 1
+    assert photo.radiance.mean(0)[photo.alpha > 0].mean() > 0.05
+    assert (face.points_px - face.centre_px).abs().max() < face.side_px / 2
     network = GeometryNetwork(GeometryNetworkSettings("paper", 80, 29))
     objective = GeometryObjective(faces, network, FEW)
     sum(objective(draw(objective, 1)).values()).backward()
@@ -82,7 +83,7 @@ def test_the_pose_follows_every_move_of_the_crop(objective):
     """The fit to the moved landmarks is the stored fit, moved: mirror, turn, scale and shift are right."""
     batch = draw(objective, 12)
     fit = fit_batch(load_face_model(), batch.landmarks_px, crop_camera(64))
-    assert (fit.rotation.float() - batch.rotation).flatten(1).norm(dim=1).max() < 0.05  # 2 degrees
+    assert (fit.rotation.float() - batch.rotation).flatten(1).norm(dim=1).max() < 0.06  # 2.5 degrees
     assert (fit.translation_m.float() - batch.translation_m).abs().max() < 0.012
     assert (fit.beta.float() - batch.beta).abs().max() < 0.3 < fit.beta.abs().max()
 
@@ -113,5 +114,4 @@ def test_validation_is_the_same_every_time_and_shows_it(objective):
 
 
 def test_no_images_is_said(tmp_path):
-    refused(InputError, "no images of heads", RenderedFaces, tmp_path, {})
-    refused(InputError, "no baked heads", add_head_images, tmp_path, tmp_path / "out", 1, 1, 0)
+    refused(InputError, "no photos", RenderedFaces, tmp_path, backgrounds(), {})

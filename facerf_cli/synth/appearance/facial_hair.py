@@ -38,19 +38,18 @@ class FacialHair:
 
     @property
     def cover(self) -> Tensor:
-        """Cover by brows and beard together."""
+        """Coverage by brows and beard together."""
         return 1 - (1 - self.brows) * (1 - self.beard)
 
 
 def draw_facial_hair(people: People, window: Window, generator: torch.Generator) -> FacialHair:
-    """Draw brows and beard of every person."""
     brows = _brows(people, window, generator)
     beard, shadow = _beards(people, window, generator)
     return FacialHair(brows, beard, shadow)
 
 
 def _coarseness(window: Window) -> float:
-    """Number of hairs drawn as one stroke, because texels are too large to separate them."""
+    """Return how many hairs one stroke draws, because texels are too large to separate them."""
     return max(1.0, min(window.texel_mm) / 0.6)
 
 
@@ -85,7 +84,7 @@ def _brows(people: People, window: Window, generator: torch.Generator) -> Tensor
 
 
 def _brow_line(along: Tensor) -> tuple[Tensor, Tensor]:
-    """Middle [N, 2] of the right brow at 0 (inner end) to 1 (outer end), and its slope there in degrees."""
+    """Return points [N, 2] along the right brow, from 0 (inner end) to 1, and its slope there in degrees."""
     points = torch.from_numpy(LANDMARK_MM[22:27]).float() + torch.tensor([0.0, 1.8])
     at = along.clamp(0, 1) * 4
     low = at.floor().clamp(max=3).long()
@@ -97,14 +96,14 @@ def _brow_line(along: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _lookup(table: str, at: Tensor) -> Tensor:
-    """Values of a table interpolated at positions [N] in 0..1."""
+    """Interpolate a table at positions [N] in 0..1."""
     values = _TABLES[table]
-    found = np.interp(at.numpy(), np.linspace(0, 1, len(values)), values)
-    return torch.from_numpy(found).float()
+    sampled = np.interp(at.numpy(), np.linspace(0, 1, len(values)), values)
+    return torch.from_numpy(sampled).float()
 
 
 def _below_edge(window: Window, edge: str, shift_mm: Tensor | float = 0) -> Tensor:
-    """Distance [1 or B, 1, T, T] in millimetres below an edge, the same on both sides of the face."""
+    """Return the distance [1 or B, 1, T, T] in millimetres below an edge that is symmetric."""
     x, y = places_mm(window)
     out = (x.abs() / float(UV_SIZE_MM[0])).clamp(max=1)
     u, v = np.array(_TABLES[edge]).T
@@ -114,7 +113,7 @@ def _below_edge(window: Window, edge: str, shift_mm: Tensor | float = 0) -> Tens
 
 @lru_cache(maxsize=4)  # all people share it
 def beard_density(window: Window) -> Tensor:
-    """Density [1, 1, T, T] of a beard, about 0..1: thin toward the cheeks and on the neck."""
+    """Return the density [1, 1, T, T] of a beard, about 0..1: thin toward the cheeks and on the neck."""
     x, y = places_mm(window)
     lower = smooth(_below_edge(window, "beard_edge") / 20 + 0.5)
     neck = smooth((186 - y) / 36)[None, None]
@@ -189,5 +188,5 @@ def scalp_hair(people: People, window: Window, above_mm: Tensor, generator: torc
 
 
 def above_hairline(people: People, window: Window) -> Tensor:
-    """Distance [B, 1, T, T] in millimetres above each person's hairline."""
+    """Return the distance [B, 1, T, T] in millimetres above each person's hairline."""
     return -_below_edge(window, "scalp_edge", each(people.hairline_mm))

@@ -33,7 +33,7 @@ class Appearance:
     """Materials by name of the part, and the traits of the person.
 
     The texture of the skin covers the canvas: the UV map of the face widened to `CANVAS_SPAN`. scattering_mm
-    [3]: sigma of the Gaussian by which light of each channel spreads under the skin.
+    [3]: sigma of the Gaussian that spreads each channel's light under the skin.
     """
 
     materials: dict[str, Material]
@@ -73,7 +73,7 @@ def canvas_uv(side: int) -> Tensor:
 
 
 def with_short_hair(appearance: Appearance, cover: Tensor, generator: torch.Generator) -> Appearance:
-    """The same person with short hair painted on the scalp, with the cover [T, T] on the canvas.
+    """Return the person with short hair painted on the scalp, with coverage [T, T] on the canvas.
 
     Its colour is the mean of the hair's roots.
     """
@@ -98,13 +98,12 @@ def sample(appearance: Appearance, part: Tensor, uv: Tensor) -> Material:
         texture = torch.cat([material.albedo, material.specular, material.roughness, material.relief])
         grid = (2 * at - 1).view(1, 1, -1, 2)
         beyond = "reflection" if name in ("cloth", "hat") else "border"
-        found = F.grid_sample(texture[None], grid, padding_mode=beyond, align_corners=False)
-        values[chosen] = found[0, :, 0].T
+        sampled = F.grid_sample(texture[None], grid, padding_mode=beyond, align_corners=False)
+        values[chosen] = sampled[0, :, 0].T
     return Material(values[:, :3], values[:, 3], values[:, 4], values[:, 5:])
 
 
 def _flat(albedo: Tensor, specular: float, roughness: float, relief: Tensor | None = None) -> Material:
-    """A material with uniform gloss."""
     one = torch.ones(1, *albedo.shape[1:])
     return Material(
         albedo.clamp(0.003, 0.95),
@@ -115,7 +114,6 @@ def _flat(albedo: Tensor, specular: float, roughness: float, relief: Tensor | No
 
 
 def _uniform(low: float, high: float, generator: torch.Generator) -> float:
-    """Draw a number between two bounds."""
     return float(Uniform(generator)(low, high))
 
 
@@ -176,7 +174,6 @@ def _hair(people: People, generator: torch.Generator) -> Material:
 
 
 def _hair_name(people: People) -> str:
-    """The common name of a person's hair colour."""
     eumelanin, pheomelanin = float(people.hair_eumelanin[0]), float(people.hair_pheomelanin[0])
     if people.grey[0] > 0.5:
         return "grey"

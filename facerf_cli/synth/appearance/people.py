@@ -13,6 +13,12 @@ from facerf_cli.synth.shading import Material
 
 DARKEST, LIGHTEST = 0.23, 0.0075  # melanin fractions of the darkest and of the lightest skin
 RANDOM_TEXTURES = 0.06  # fraction of people with random colours instead of skin tones
+_TABLES = tables_of(__file__)
+_CORNERS = ((36, 39), (42, 45))  # landmarks of the eyes' corners
+IRIS_DEG = 29.0  # edge of the iris, from the gaze axis
+_RADIUS_MM = 12.0  # of the eyeball
+_IRISES: dict[str, list[float]] = _TABLES["irises"]  # colours, linear Rec.709
+_FAIR_SHARES = (0.35, 0.15, 0.15, 0.25, 0.10)  # frequency among fair people; all others are brown
 
 
 @dataclass(frozen=True)
@@ -48,7 +54,7 @@ class People:
     lipstick_blue: Tensor
     eye_shadow: Tensor  # cover
     eyeliner: Tensor
-    foundation: Tensor  # strength by which it evens out the skin
+    foundation: Tensor  # how strongly it evens out the skin
     random_texture: Tensor  # 0 or 1
 
 
@@ -102,20 +108,17 @@ def draw_people(count: int, generator: torch.Generator) -> People:
 
 
 def parameters_of(people: People, index: int) -> dict[str, float | str | bool]:
-    """The parameters of one person by name, rounded, for a record."""
+    """Return the parameters of one person by name, rounded, for a record."""
     return {field.name: round(float(getattr(people, field.name)[index]), 4) for field in fields(people)}
 
 
 def each(values: Tensor) -> Tensor:
-    """A parameter [B] as [B, 1, 1, 1], to combine with textures [B, C, T, T]."""
+    """Return a parameter [B] as [B, 1, 1, 1], to combine with textures [B, C, T, T]."""
     return values.view(-1, 1, 1, 1)
 
 
-_TABLES = tables_of(__file__)
-
-
 def hair_albedo(eumelanin: Tensor, pheomelanin: Tensor, grey: Tensor) -> Tensor:
-    """Colour [..., 3] of dense hair, linear Rec.709, from melanins [...] in the units of d'Eon et al.
+    """Return linear Rec.709 colours [..., 3] of dense hair from melanins [...] in the units of d'Eon et al.
 
     Absorption after d'Eon et al. (*An energy-conserving hair reflectance model*, 2011), colour of many fibres
     after Chiang et al. (*A practical and controllable hair and fur model*, 2016), plus a small reflection at
@@ -126,13 +129,6 @@ def hair_albedo(eumelanin: Tensor, pheomelanin: Tensor, grey: Tensor) -> Tensor:
     pigmented = torch.exp(-5.89 * absorbed.sqrt()) + torch.tensor([0.011, 0.0095, 0.0085])
     white = torch.tensor([0.44, 0.41, 0.36])
     return pigmented + grey[..., None] * (white - pigmented)
-
-
-_CORNERS = ((36, 39), (42, 45))  # landmarks of the eyes' corners
-IRIS_DEG = 29.0  # edge of the iris, from the gaze axis
-_RADIUS_MM = 12.0  # of the eyeball
-_IRISES: dict[str, list[float]] = _TABLES["irises"]  # colours, linear Rec.709
-_FAIR_SHARES = (0.35, 0.15, 0.15, 0.25, 0.10)  # frequency among fair people; all others are brown
 
 
 def draw_irises(people: People, generator: torch.Generator) -> tuple[Tensor, list[str]]:
@@ -174,7 +170,7 @@ def eyeball_textures(
 
 
 def _sclera(side: int, angle: Tensor, redness: float, age: float, generator: torch.Generator) -> Tensor:
-    """Albedo [3, T, T] of the sclera: off-white, yellower with age, with more pink and veins off the iris."""
+    """Return the albedo [3, T, T] of the sclera: yellower with age, with more pink and veins off the iris."""
     young, old = torch.tensor([0.50, 0.46, 0.44]), torch.tensor([0.47, 0.41, 0.33])
     base = (young + (old - young) * (age - 18) / 57 * 0.8).view(3, 1, 1)
     ridges = 1 - plain_noise((side, side), 26, generator).abs() * 3
@@ -186,7 +182,7 @@ def _sclera(side: int, angle: Tensor, redness: float, age: float, generator: tor
 def _iris(
     angle: Tensor, turn: Tensor, pupil_deg: float, colour: Tensor, generator: torch.Generator
 ) -> Tensor:
-    """Albedo [3, T, T] of iris and pupil: radial fibres, a collarette and a limbal ring."""
+    """Return the albedo [3, T, T] of iris and pupil: radial fibres, a collarette and a limbal ring."""
     fibres = torch.zeros_like(angle)
     for waves in (17, 31, 53, 89):
         phase = 2 * torch.pi * torch.rand((), generator=generator)
@@ -203,7 +199,7 @@ def _iris(
 
 
 def paint_eyes(albedo: Tensor, people: People, window: Window, generator: torch.Generator) -> Tensor:
-    """The face's albedo [B, 3, T, T] with eyes painted between the lids; both have one gaze."""
+    """Return the face's albedo [B, 3, T, T] with eyes painted between the lids; both have one gaze."""
     uniform = Uniform(generator, (len(albedo), 1, 1, 1))
     between = mask(window, "eyes", 1.0)
     colours, _ = draw_irises(people, generator)

@@ -44,6 +44,9 @@ _FOLDS = tables_of(__file__)  # wrinkles by name
 _FOREHEAD_MM = (-12.0, 0.0, 11.0)  # heights of the forehead's lines around a line above the brows
 _FOREHEAD_HALF_MM = 46.0  # half length
 _FOREHEAD_DEPTH_MM = 0.3
+# Sigma of each channel's light under the skin: root mean square of the sum of Gaussians that
+# d'Eon and Luebke fitted to skin (*GPU Gems 3*, ch. 14).
+_SCATTERING_MM = (1.18, 0.26, 0.16)
 
 
 def draw_relief(
@@ -70,16 +73,16 @@ def draw_relief(
 
 
 def _pore_places(window: Window) -> Tensor:
-    """Strength [1, 1, T, T] of pores: high on nose, inner cheeks and chin, low near the eyes."""
+    """Return the strength [1, 1, T, T] of pores: high on nose, inner cheeks and chin, low near the eyes."""
     cheeks = blobs(window, 0.37, 0.52, 22)
     return 0.55 + (0.9 * blob(window, 30, 15) + 0.7 * cheeks + 0.4 * blob(window, 8, 14)).clamp(0, 1)
 
 
 @lru_cache(maxsize=1)  # all people share it
 def _fold_lines() -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """All K folds together: control points [P, 2], basis [N, P], taper [N], fold index [N] and depth [K].
+    """Join all K folds: control points [P, 2], basis [N, P], taper [N], fold index [N] and depth [K].
 
-    The product of basis and control points is the N sample points, for each of which taper scales the depth.
+    Basis times control points gives the N sample points; taper scales the depth at each.
     The mirror image of a fold is a separate fold and follows it.
     """
     folds = [
@@ -129,15 +132,10 @@ def _wrinkles(people: People, window: Window, generator: torch.Generator) -> Ten
     return blurred(layers, window, _WRINKLE_WIDTH_MM) * (_WRINKLE_WIDTH_MM * (2 * np.pi) ** 0.5)
 
 
-# Sigma by which light of each channel spreads under the skin: root mean square of the sum of Gaussians that
-# d'Eon and Luebke fitted to skin (*GPU Gems 3*, ch. 14).
-_SCATTERING_MM = (1.18, 0.26, 0.16)
-
-
 def draw_skin(faces: int, side: int, generator: torch.Generator) -> Skin:
     """Draw B people's skins as textures of `side` texels with painted eyes, evenly from light to dark.
 
-    Their gloss varies more than that of `paint_skin`, because the highlights of photos vary as much.
+    Their gloss varies more than in `paint_skin`, because highlights in photos vary as much.
     """
     people = draw_people(faces, generator)
     window = Window(side, UV_SPAN)
@@ -160,7 +158,7 @@ def draw_skin(faces: int, side: int, generator: torch.Generator) -> Skin:
 
 
 def with_scalp(skin: M, cover: Tensor, colour: Tensor, generator: torch.Generator) -> M:
-    """The skin under short hair of a colour, with a cover [..., 1, T, T] in 0..1."""
+    """Return the skin under short hair of a colour, with a cover [..., 1, T, T] in 0..1."""
     streaks = (1 + 0.2 * torch.randn(cover.shape, generator=generator)).clamp(0.3, 1.8)
     return replace(
         skin,
@@ -177,7 +175,7 @@ def bare_skin(people: People) -> Tensor:
 
 
 def scattering_mm(people: People) -> Tensor:
-    """Sigma [B, 3] of the Gaussian by which light of each channel spreads under people's skin."""
+    """Return the sigma [B, 3] of the Gaussian that spreads each channel's light under the skin."""
     return torch.tensor(_SCATTERING_MM).expand(len(people.melanin), 3).clone()
 
 
@@ -247,7 +245,7 @@ def _pigments(
 
 
 def _around_eyes(window: Window) -> Tensor:
-    """Mask [1, 1, T, T] of the lids and the hollows under them."""
+    """Return the mask [1, 1, T, T] of the lids and the hollows under them."""
     near = smooth((inside(window, "eyes") + 13) / 13)
     under = blobs(window, 0.375, 0.385, 16, 0.5)
     return (0.7 * near + 0.6 * under).clamp(0, 1)
@@ -285,7 +283,7 @@ def _spots(
 
 
 def _darkness(people: People) -> Tensor:
-    """Darkness [B, 1, 1, 1] of people's hair relative to brown."""
+    """Return the darkness [B, 1, 1, 1] of people's hair relative to brown."""
     dark = (people.hair_eumelanin / 3).clamp(0.15, 1.6) * (1 - 0.6 * people.grey)
     return each(dark)
 
@@ -293,14 +291,14 @@ def _darkness(people: People) -> Tensor:
 def _random_colours(
     count: int, window: Window, coarse: Tensor, middle: Tensor, generator: torch.Generator
 ) -> Tensor:
-    """Draw random albedo [B, 3, T, T], so that a network does not rely on skin tones alone."""
+    """Draw random albedo [B, 3, T, T], so that a network does not rely on skin tones."""
     coloured = torch.cat([noise(count, window, 45, generator, octaves=2) for _ in range(3)], 1)
     mean = 0.15 + 0.4 * torch.rand(count, 3, 1, 1, generator=generator)
     return (mean * torch.exp(0.35 * coloured + 0.12 * middle + 0.1 * coarse)).clamp(0.02, 0.85)
 
 
 def _make_up(albedo: Tensor, people: People, window: Window) -> Tensor:
-    """The albedo [B, 3, T, T] with lipstick, eye shadow and eyeliner."""
+    """Return the albedo [B, 3, T, T] with lipstick, eye shadow and eyeliner."""
     colour = torch.stack([people.lipstick_red, people.lipstick_green, people.lipstick_blue], -1)
     cover = 0.8 * each(people.lipstick) * mask(window, "lips", 1.6, -0.3)
     own = albedo.mean(1, keepdim=True) / albedo.mean((1, 2, 3), keepdim=True).clamp_min(0.02)
@@ -315,7 +313,7 @@ def _make_up(albedo: Tensor, people: People, window: Window) -> Tensor:
 
 
 def _with_hair(albedo: Tensor, people: People, hair: FacialHair, fine: Tensor, middle: Tensor) -> Tensor:
-    """The albedo with brows and beard; brows turn grey later than other hair."""
+    """Return the albedo with brows and beard; brows turn grey later than other hair."""
     streaks = (1 + 0.25 * fine + 0.12 * middle).clamp(0.3, 1.8)
     beard_grey, brow_grey = 0.7 * people.grey**1.5, 0.45 * (people.grey - 0.5).clamp_min(0)
     for cover, melanin, grey in ((hair.beard, 0.8, beard_grey), (hair.brows, 1.3, brow_grey)):
@@ -325,7 +323,7 @@ def _with_hair(albedo: Tensor, people: People, hair: FacialHair, fine: Tensor, m
 
 
 def _openings(albedo: Tensor, window: Window) -> Tensor:
-    """The albedo with dark nostrils and a dark line between the lips."""
+    """Return the albedo with dark nostrils and a dark line between the lips."""
     nostrils = mask(window, "nostrils", 2.5)
     slit = mask(window, "mouth", 1.2, 0.5)
     dark = torch.tensor([0.80, 0.93, 0.93]).view(1, 3, 1, 1)
@@ -333,7 +331,7 @@ def _openings(albedo: Tensor, window: Window) -> Tensor:
 
 
 def _lid_rims(albedo: Tensor, people: People, window: Window) -> Tensor:
-    """The albedo with the wet pink rim of the lids and the roots of the lashes along their edge."""
+    """Return the albedo with the wet pink rim of the lids and the roots of the lashes along their edge."""
     beyond = inside(window, "eyes")
     upper = smooth((62.5 - places_mm(window)[1]) / 5)[None, None]
     rim = smooth((beyond + 0.6) / 1.2)

@@ -21,14 +21,14 @@ def fill(
     people: Iterable[int],
     jobs: int,
     metadata: dict[str, str] | None = None,
-    last: str = "",
+    last: str = "{:05d}",
 ) -> None:
     """Write the files that `make` gives for each person, by `jobs` processes of one thread.
 
-    People whose file, or whose last one of several with this ending, exists are finished and kept.
+    People whose file `last` exists are finished and kept.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    missing = [index for index in people if not file_of(folder, f"{index:05d}{last}").exists()]
+    missing = [index for index in people if not file_of(folder, last.format(index)).exists()]
     in_shards(partial(_fill_shard, folder, make, metadata), missing, jobs)
 
 
@@ -47,16 +47,11 @@ def file_of(folder: Path, name: str) -> Path:
 
 
 def files_in(folder: Path, otherwise: str = "") -> list[Path]:
-    """All files of people; InputError that ends with `otherwise`, if given, where there are none."""
-    found = sorted(folder.glob("[0-9]*.safetensors"))
-    if otherwise and not found:
+    """Return all files of people; if there are none, raise an InputError that ends with `otherwise`."""
+    files = sorted(folder.glob("[0-9]*.safetensors"))
+    if otherwise and not files:
         raise InputError(f"{folder}: {otherwise}")
-    return found
-
-
-def split_heads(count: int, held_out: int) -> tuple[Tensor, Tensor]:
-    """Indices of the training heads, and of the first `held_out` heads after the mean face."""
-    return torch.arange(held_out + 1, count), torch.arange(1, held_out + 1)
+    return files
 
 
 def split_people(count: int, held_out: int) -> tuple[list[int], list[int]]:

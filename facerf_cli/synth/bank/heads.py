@@ -1,12 +1,13 @@
 """Bank of baked heads: light transport in UV space, views as fits to photos see them, and their samples.
 
-Noisy landmarks give the crop and the fit of each photo, as for a real photo. Unwrapping an image of the true
+Noisy landmarks set the crop and the fit of each photo, like in real ones. Unwrapping an image of the true
 (u, v) then gives the warp: the true texel that each texel of the fitted UV map shows.
 """
 
 import re
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -34,18 +35,23 @@ from facerf_cli.light.transport import BakeSettings, bake_transport
 from facerf_cli.raster.camera import Camera, crop_camera, pose_to_rotation, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import bake_attributes, inpaint, normal_map, texel_centres_uv, unwrap
-from facerf_cli.synth.bank import Files, file_of, files_in, fill, split_heads
+from facerf_cli.synth.bank import Files, file_of, files_in, fill
 from facerf_cli.synth.bank.texture_samples import HeadFields, Sample, draw_sample, head_fields
 from facerf_cli.synth.random_fields import Random
 
 # Expression shapes that are never drawn: they do not move skin, or correct another shape.
 _LEFT_OUT = ("PupilDilate", "mouthClose", "eyeLook")
-_COMMON = ("jawOpen", "jaw_open", "mouthSmile", "smile")  # drawn more often, as in photos
+_COMMON = ("jawOpen", "jaw_open", "mouthSmile", "smile")  # drawn more often, since photos show them often
 _SIDE = re.compile(r"(?<!jaw)_(L|R|left|right)$")  # paired shapes; the jaw moves to one side only
 _BAKE = BakeSettings(light_samples=4, bounce_samples=16)
-
-
 cached_face_model = lru_cache(maxsize=2)(load_face_model)  # a worker loads a model once
+_PHOTO_SIDE_PX = 1000
+_FACE_SIDE_M = 0.26  # approximate side of the square of a crop, at the face
+_FOCALS = (1.6, 6.0)  # range of focal lengths, in sides of the photo
+_FACE_SHARES = (0.3, 0.8)  # range of the side of the crop, in sides of the photo
+_LEAST_COVER = 0.9  # share of a texel that must show the face to be visible
+# Landmarks of contour, brows, nose, eyes and mouth, whose errors have a common part.
+LANDMARK_GROUPS = tuple(slice(*ends) for ends in pairwise((0, 17, 22, 27, 36, 42, 48, 68)))
 
 
 @dataclass(frozen=True)
@@ -75,9 +81,9 @@ def bake_heads(
     name = load_face_model(face_model).name
     for path in files_in(folder):
         with safe_open(path, framework="pt") as file:
-            found = (file.metadata() or {}).get("face_model")
-        if found != name:
-            raise InputError(f"{path}: the head is of face model {found}, not of {name}; give another --bank")
+            baked = (file.metadata() or {}).get("face_model")
+        if baked != name:
+            raise InputError(f"{path}: baked from face model {baked}, not {name}; use another --bank")
     fill(folder, partial(_baked, face_model, seed, settings), range(count), jobs, {"face_model": name})
 
 
@@ -95,7 +101,9 @@ def bake_head(model: MorphableModel, index: int, seed: int, settings: HeadBakeSe
     alpha, beta = draw_coefficients(model, random, settings) if index else mean_coefficients(model)
     vertices = model.vertices(alpha[None], beta[None])[0]
     if index:
-        vertices = vertices + _free_deformation(random, settings)
+        basis = load_face_model(BUILTIN).identity  # a Gaussian process of smooth deformations
+        weights = torch.from_numpy(random.normal(0, settings.free_std, len(basis))).float()
+        vertices = vertices + torch.einsum("k,kvc->vc", weights, basis)
     triangles = grid_triangles()
     positions = bake_attributes(vertices, GRID, settings.side).permute(1, 2, 0).numpy()
     normals = normal_map(vertices, triangles, settings.side).permute(1, 2, 0).numpy()
@@ -116,13 +124,6 @@ def bake_head(model: MorphableModel, index: int, seed: int, settings: HeadBakeSe
         "visibility": _bytes(transport.visibility),
         "bounce": _bytes(np.sqrt(transport.bounce)),
     }
-
-
-def _free_deformation(random: Random, settings: HeadBakeSettings) -> Tensor:
-    """Draw a smooth deformation [V, 3] (m) from the built-in model's Gaussian process."""
-    basis = load_face_model(BUILTIN).identity
-    weights = torch.from_numpy(random.normal(0, settings.free_std, len(basis))).float()
-    return torch.einsum("k,kvc->vc", weights, basis)
 
 
 def _bytes(values: np.ndarray) -> Tensor:
@@ -153,23 +154,6 @@ def draw_coefficients(
             if _SIDE.sub("", name) == stem:
                 beta[index] = strength * random.uniform(0.7, 1.0)
     return alpha, beta
-
-
-_PHOTO_SIDE_PX = 1000
-_FACE_SIDE_M = 0.26  # approximate side of the square of a crop, at the face
-_FOCALS = (1.6, 6.0)  # range of focal lengths, in sides of the photo
-_FACE_SHARES = (0.3, 0.8)  # range of the side of the crop, in sides of the photo
-_LEAST_COVER = 0.9  # share of a texel that must show the face to be visible
-# Landmarks of contour, brows, nose, eyes and mouth, whose errors have a common part.
-_GROUPS = (
-    slice(0, 17),
-    slice(17, 22),
-    slice(22, 27),
-    slice(27, 36),
-    slice(36, 42),
-    slice(42, 48),
-    slice(48, 68),
-)
 
 
 @dataclass(frozen=True)
@@ -226,20 +210,16 @@ def build_views(
 
 @dataclass(frozen=True)
 class HeadPhoto:
-    """A head in front of a camera, cropped by noisy landmarks."""
+    """Head in front of a camera, cropped by noisy landmarks."""
 
     vertices_camera: Tensor  # [V, 3]
     rotation: Tensor  # [3, 3] head_to_camera
     camera: Camera  # of the crop, with the true focal length and principal point
     landmarks_px: Tensor  # [68, 2] in the crop, with the errors of a detector
 
-    def true_landmarks(self) -> Tensor:
-        """Landmarks [68, 3] of the mesh, camera space."""
-        return landmarks_of(self.vertices_camera)
-
 
 def landmarks_of(vertices: Tensor) -> Tensor:
-    """Landmarks [68, 3] of the canonical mesh [V, 3]."""
+    """Return landmarks [68, 3] of the canonical mesh [V, 3]."""
     corners, weights = landmark_weights()
     return (vertices[corners] * weights[..., None]).sum(1)
 
@@ -277,7 +257,7 @@ def _detected(landmarks_px: Tensor, random: Random, settings: ViewSettings) -> T
     eyes = landmarks_px[list(OUTER_EYE_CORNERS)]
     unit_px = float((eyes[0] - eyes[1]).norm())
     error = random.normal(0, settings.point_noise, (68, 2))
-    for group in _GROUPS:
+    for group in LANDMARK_GROUPS:
         error[group] += random.normal(0, settings.group_noise, 2)
     error[list(CONTOUR)] += random.normal(0, settings.contour_noise, (len(CONTOUR), 2))
     return landmarks_px + torch.from_numpy(error).float() * unit_px
@@ -297,17 +277,16 @@ class Bank:
     """Baked heads and their views, a `SampleSource`; head 0 is the mean face."""
 
     baked: list[HeadFields]
-    views: list[dict[str, Tensor]]  # from `views.build_views`
+    views: list[dict[str, Tensor]]  # from `build_views`
     provenance: dict[str, Any]
 
     @property
     def side(self) -> int:
-        """Texels along a side of every field."""
         return int(self.baked[0].normals.shape[-1])
 
     def heads(self, held_out: int) -> tuple[Tensor, Tensor]:
-        """See `split_heads`."""
-        return split_heads(len(self.baked), held_out)
+        """See `SampleSource`; the mean face is in neither part."""
+        return torch.arange(held_out + 1, len(self.baked)), torch.arange(1, held_out + 1)
 
     def draw(self, heads: Tensor, lights: int, generator: torch.Generator) -> Sample:
         """Draw one sample of each head in `heads` [B], with `lights` target lights."""
@@ -315,7 +294,7 @@ class Bank:
         return draw_sample(chosen, lights, generator)
 
     def mean_face(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Normals [3, T, T], visibility [L, T, T] and light directions [L, 3] of head 0, head frame."""
+        """Return head 0's normals [3, T, T], visibility [L, T, T] and light directions [L, 3], head frame."""
         mean = self.baked[0]
         return mean.normals, mean.visibility.float() / 255, mean.directions
 
@@ -334,11 +313,11 @@ def _viewed(heads: Path, fitted_with: str, count: int, seed: int, index: int) ->
 
 def load_bank(heads: Path, views: Path, provenance: dict[str, Any]) -> Bank:
     """Load all heads that have both a bake and views; raise InputError if there are none."""
-    found = [path for path in files_in(heads) if (views / path.name).exists()]
-    if not found:
+    paths = [path for path in files_in(heads) if (views / path.name).exists()]
+    if not paths:
         raise InputError(f"{heads}: no baked heads with views; run `facerf train` to build them")
     return Bank(
-        [head_fields(load_file(path)) for path in found],
-        [load_file(views / path.name) for path in found],
+        [head_fields(load_file(path)) for path in paths],
+        [load_file(views / path.name) for path in paths],
         provenance,
     )

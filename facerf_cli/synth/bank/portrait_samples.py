@@ -1,6 +1,6 @@
 """Samples that the Portrait Network is trained on: a photo in a random light, and under single lights.
 
-The people are those of a bank (`transport.py`), or of a dataset (`dataset/portraits.py`).
+The people come from a bank (`people.py`) or a dataset (`dataset/portraits.py`).
 """
 
 import math
@@ -22,19 +22,18 @@ from facerf_cli.portrait.person import SIDES
 from facerf_cli.portrait.proxy import own_shading
 from facerf_cli.relighting.white import even_shade_of
 from facerf_cli.synth.bank import files_in, split_people
-from facerf_cli.synth.bank.face_crops import gaussian_blurred, turned
-from facerf_cli.synth.bank.portraits import Lamp, background_of, draw_photo_light
+from facerf_cli.synth.bank.people import KeyLight, draw_photo_light
+from facerf_cli.synth.bank.proxies import seen_path
 from facerf_cli.synth.bank.texture_samples import in_front
-from facerf_cli.synth.bank.transport import seen_path
-from facerf_cli.synth.portraits import BakedPortrait, albedo_of, images_under
+from facerf_cli.synth.camera import SimulatedCamera, background, recoloured, turned
 from facerf_cli.synth.random_fields import Uniform
+from facerf_cli.synth.renderer import BakedView, albedo_of, images_under
 from facerf_cli.synth.shading import Material
 
-_LAMP = Lamp(0.3, 0.01, 2, 0.3, 1.0)
-_GREY = 0.2  # share of grey photos
+_KEY_LIGHT = KeyLight(0.3, 0.01, 2, 0.3, 1.0)
+_CAMERA = SimulatedCamera(grey=0.2, blur_px=1.2, phone=0.2, contrast=(0.0, 0.3))
 SMALL = 4  # pixels along each side that are averaged where the photo's own light is summed
 _SHADOWED = 0.25  # share of photos in the shadow of something that they do not show
-_PHONES, _CONTRAST = 0.2, 0.4  # shares of photos that a phone sharpens, and whose contrast a camera raises
 _EMPTY_BYTES = 1000  # a file without tensors is smaller
 _BRIGHTEST = 8.0  # of targets; brighter highlights are clipped
 # Lights from behind: elevation and least azimuth, and the share of targets that they get beside their own.
@@ -43,15 +42,10 @@ _BACK_EL_DEG, _BACK_AZ_DEG, _BACK = (0.0, 40.0), 120.0, 0.08
 
 @dataclass(frozen=True, eq=False)
 class StoredView:
-    """One view of the bank, and the materials of its facets in several looks."""
+    """View from a bank, and the materials of its facets in several looks."""
 
-    portrait: BakedPortrait
+    portrait: BakedView
     looks: list[Material]
-
-    @property
-    def alpha(self) -> Tensor:
-        """Cover [S, S] of the person."""
-        return 1 - self.portrait.classes[..., 0].float() / 255
 
 
 def load_view(path: Path) -> StoredView:
@@ -61,12 +55,12 @@ def load_view(path: Path) -> StoredView:
     )
     relief = torch.zeros(albedo.shape[1], 2)
     looks = [Material(*look, relief) for look in zip(albedo, specular, roughness, strict=True)]
-    return StoredView(BakedPortrait(**tensors), looks)
+    return StoredView(BakedView.unpacked(tensors), looks)
 
 
 @dataclass(frozen=True)
 class PortraitSample(Batch):
-    """Photos of B people, what is seen in them, and T target images of each."""
+    """Photos of B people, what the networks see in them, and T target images of each."""
 
     inputs: PortraitInputs
     lights: Tensor  # [B, T, 3] of the targets
@@ -83,30 +77,26 @@ class PortraitSample(Batch):
 
 
 class PortraitSource(Protocol):
-    """People to draw samples of: synthetic ones, or those of a dataset (`dataset/portraits.py`)."""
+    """People to draw samples of: synthetic, or from a dataset (`dataset/portraits.py`)."""
 
     @property
     def provenance(self) -> dict[str, Any]:
         """Origin and licence of the people."""
-        ...
 
     def people(self, held_out: int) -> tuple[list[int], list[int]]:
         """Indices of the people to train on, and of at most `held_out` others."""
-        ...
 
     def sides_px(self, people: Sequence[int]) -> list[int]:
         """Sides of the squares of some people, of each square."""
-        ...
 
     def draw(
         self, people: Sequence[int], targets: int, generator: torch.Generator, side_px: int | None = None
     ) -> PortraitSample:
         """Draw one sample [1, ...] of some people, with `targets` lights, of a side if one is given."""
-        ...
 
 
 class StoredTransport:
-    """The bank's portraits, read when they are drawn."""
+    """Squares of a bank, read when they are drawn."""
 
     def __init__(self, folder: Path, backgrounds: Tensor, provenance: dict[str, Any]) -> None:
         people: dict[str, dict[Path, int]] = {}
@@ -120,22 +110,19 @@ class StoredTransport:
         self.provenance = provenance
 
     def people(self, held_out: int) -> tuple[list[int], list[int]]:
-        """See `split_people`."""
         return split_people(len(self.views), held_out)
 
     def sides_px(self, people: Sequence[int]) -> list[int]:
-        """See `PortraitSource`."""
         return [side for one in people for side in self.views[one].values()]
 
     def draw(
         self, people: Sequence[int], targets: int, generator: torch.Generator, side_px: int | None = None
     ) -> PortraitSample:
-        """See `PortraitSource`."""
         of_side = (
             [path for path, side in self.views[one].items() if side_px in (None, side)] for one in people
         )
-        found = [paths for paths in of_side if paths]
-        views = found[_below(len(found), generator)]
+        of_people = [paths for paths in of_side if paths]
+        views = of_people[_below(len(of_people), generator)]
         path = views[_below(len(views), generator)]
         view = load_view(path)
         surface = view.looks[_below(len(view.looks), generator)]
@@ -148,8 +135,8 @@ class StoredTransport:
             images=images_under(view.portrait, surface, torch.cat([weights[None], single])),
             albedo=albedo,
             normals=normals,
-            shares=view.portrait.classes.permute(2, 0, 1).float() / 255,
-            behind=1 - view.alpha,
+            shares=view.portrait.classes.permute(2, 0, 1),
+            behind=1 - view.portrait.alpha,
             rig=rig,
             weights=weights,
             chosen=chosen,
@@ -158,18 +145,17 @@ class StoredTransport:
 
 
 def _side_px(path: Path) -> int:
-    """Side of the square of a view."""
     with safe_open(path, framework="pt") as file:
         return int(file.get_slice("classes").get_shape()[0])
 
 
 @dataclass(frozen=True, eq=False)
 class LitPerson:
-    """A person under the light of a photo, and under T lights of a rig."""
+    """Person under the light of a photo, and under T lights of a rig."""
 
     images: Tensor  # [1 + T, 3, S, S]
     albedo: Tensor  # [3, S, S], or what stands for it
-    normals: Tensor | None  # [3, S, S]; None where nobody knows them
+    normals: Tensor | None  # [3, S, S]; None if unknown
     shares: Tensor  # [C, S, S] of the classes
     behind: Tensor  # [S, S], the share of what lies behind the person
     rig: Tensor  # [L, 3]
@@ -180,7 +166,7 @@ class LitPerson:
 def sample_of(
     lit: LitPerson, seen: dict[str, Tensor], backgrounds: Tensor, generator: torch.Generator
 ) -> PortraitSample:
-    """Photograph a person before a background; `seen` are the layers of `transport.layers_of`.
+    """Photograph a person in front of a background; `seen` are the layers of `proxies.layers_of`.
 
     Where `seen` has the visibility of a rig all around as `around`, with directions `around_directions`, the
     person's own rig need not lie all around.
@@ -189,13 +175,14 @@ def sample_of(
     visible = seen["visible"].float() / 255
     around = seen["around"].float() / 255 if "around" in seen else visible
     directions = seen.get("around_directions", lit.rig)
-    images, albedo = _balanced(lit.images, lit.albedo, generator)
+    colours = _CAMERA.colours(generator)
+    images, albedo = recoloured(lit.images, colours), recoloured(lit.albedo, colours)
     skin, side = classes[SKIN], classes.shape[-1]
     scale = MEAN_RADIANCE / _mean_over(albedo, skin)
-    stored = backgrounds[_below(len(backgrounds), generator)]
-    background = 4 * background_of(stored, side, generator) * lit.behind
+    behind = 4 * recoloured(background(backgrounds, side, generator), colours) * lit.behind
     lit_skin = images[0] / _mean_over(images[0], skin)
-    photo = _as_taken(lit_skin * _foreign_shadow(side, generator) + background, generator)
+    scene = lit_skin * _foreign_shadow(side, generator) + behind
+    photo = _CAMERA.take(scene, torch.ones(()), generator)
     rows = int(seen.get("rows", side))
     photo = photo[:, torch.arange(side).clamp(max=rows - 1)]  # as a square beyond a photo's edge shows it
     shares = lit.shares.clone()
@@ -229,15 +216,6 @@ def sample_of(
     return mirrored(batched) if torch.rand((), generator=generator) < 0.5 else batched
 
 
-def _balanced(images: Tensor, albedo: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Images [N, 3, S, S] and albedo [3, S, S] in another white balance, some of them grey."""
-    balance = torch.exp(Uniform(generator)(-0.12, 0.12, 3, 1, 1))
-    images, albedo = images * balance, albedo * balance
-    if torch.rand((), generator=generator) < _GREY:
-        images, albedo = (x.mean(-3, keepdim=True).expand_as(x) for x in (images, albedo))
-    return images, albedo
-
-
 def _below(count: int, generator: torch.Generator) -> int:
     return int(torch.randint(count, (), generator=generator))
 
@@ -254,7 +232,7 @@ def draw_targets(rig: Tensor, count: int, generator: torch.Generator) -> Tensor:
 
 def source_light(rig: Tensor, generator: torch.Generator) -> Tensor:
     """Draw weights [L, 3] of the photo's light."""
-    return draw_photo_light(rig, generator, _LAMP)
+    return draw_photo_light(rig, generator, _KEY_LIGHT)
 
 
 def _mean_over(image: Tensor, weight: Tensor) -> Tensor:
@@ -278,28 +256,6 @@ def _foreign_shadow(side: int, generator: torch.Generator) -> Tensor:
     softness = torch.exp(uniform(math.log(0.01), math.log(0.4)))
     passes = uniform(0.15, 0.8) * torch.exp(uniform(-0.15, 0.15, 3, 1, 1))
     return torch.lerp(passes, torch.ones(3, 1, 1), torch.sigmoid(distance / softness))
-
-
-def _as_taken(image: Tensor, generator: torch.Generator) -> Tensor:
-    """Take a photo of a scene [3, S, S] with a mean of about 1.
-
-    Clipping, blur or a phone's smoothing and sharpening, tone curve, contrast and noise.
-    """
-    uniform = Uniform(generator)
-    image = (image / uniform(1.6, 6.0)).clamp(0, 1)
-    camera = torch.rand((), generator=generator)
-    if camera < 0.4:
-        image = gaussian_blurred(image, float(uniform(0.3, 1.2)))
-    elif camera < 0.4 + _PHONES:
-        smooth = torch.lerp(image, gaussian_blurred(image, float(uniform(0.8, 2))), uniform(0, 0.8))
-        sharper = smooth - gaussian_blurred(smooth, float(uniform(0.7, 1.5)))
-        image = (smooth + uniform(0.3, 1.2) * sharper).clamp(0, 1)
-    image = image ** torch.exp(uniform(-0.22, 0.22))
-    if torch.rand((), generator=generator) < _CONTRAST:
-        root = image.sqrt()  # nearly as it is shown
-        image = torch.lerp(root, root.square() * (3 - 2 * root), uniform(0, 0.6)).square()
-    noise = torch.randn(image.shape, generator=generator) * uniform(0, 0.02)
-    return (image + noise * (image + 0.02).sqrt()).clamp(0, 1)
 
 
 def mirrored(sample: PortraitSample) -> PortraitSample:

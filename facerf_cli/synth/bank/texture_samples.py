@@ -22,6 +22,17 @@ from facerf_cli.synth.random_fields import LANDMARK_MM, Uniform, Window, mask, n
 from facerf_cli.synth.shading import Skin, diffuse_irradiance, highlights, scatter, tilt_normals, unit_along
 
 _FLASH_SHARE = 0.2  # share of draws that are lit by a flash near the camera
+_LIDS_MM, _LASHES_MM = 3.0, 7.0  # distance from the eye
+_LASHES_PASS = 0.6  # share of light that passes between them
+_GRAZING = 0.15  # least z of a light direction: bounds the length of a shadow
+_FRINGES, _GLASSES = 0.15, 0.08  # share of faces with each
+_BROW_MM = float(LANDMARK_MM[17:27, 1].mean())
+_EYE_MM = (float(abs(LANDMARK_MM[36:48, 0]).mean()), float(LANDMARK_MM[36:48, 1].mean()))
+_SAME_POSE_SHARE = 0.6  # share of samples whose target pose is the source pose
+_SOURCE_HIGHLIGHTS = 10  # only the brightest lights of the source have highlights
+_LEAST_POWER = 0.004  # lights of the source below this share of the brightest are skipped
+_LEAST_FACING = 0.1  # cosine to the camera below which a texel has no weight in the loss
+_VIEW_DISTANCE_M = 1.2  # distance of the crop camera from the face
 
 
 @dataclass(frozen=True)
@@ -58,7 +69,7 @@ class SampleSource(Protocol):
         """Draw one sample of each head in `heads` [B], with `lights` target lights."""
 
     def mean_face(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Normals [3, T, T], visibility [L, T, T] and light directions [L, 3] of the mean, head frame."""
+        """Return the mean's normals [3, T, T], visibility [L, T, T] and directions [L, 3], head frame."""
 
 
 def draw_light(directions: Tensor, generator: torch.Generator) -> Tensor:
@@ -85,7 +96,7 @@ def draw_light(directions: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def _lobe(directions: Tensor, axis: Tensor, sharpness: float) -> Tensor:
-    """Weights [L, 1] of an area light: a von Mises-Fisher lobe of unit sum."""
+    """Return weights [L, 1] of an area light: a von Mises-Fisher lobe of unit sum."""
     return (sharpness * (directions @ axis)).softmax(0)[:, None]
 
 
@@ -96,12 +107,12 @@ def _tint(spread: float, generator: torch.Generator) -> Tensor:
 
 
 def draw_target_lights(in_camera: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Draw indices [count] of lights at directions [L, 3], mostly in front of the face, as in photos."""
+    """Draw indices [count] of lights at directions [L, 3], mostly in front of the face, like in photos."""
     return torch.multinomial(in_front(in_camera), count, generator=generator)
 
 
 def in_front(in_camera: Tensor) -> Tensor:
-    """Weights [L] of lights at directions [L, 3] as photos have them: mostly in front of the face."""
+    """Return weights [L] of lights at directions [L, 3] as photos have them: mostly in front of the face."""
     return torch.sigmoid(6 * (in_camera[:, 2] + 0.1)) + 0.05
 
 
@@ -174,14 +185,9 @@ def _mean(field: Tensor, visible: Tensor) -> Tensor:
     return total / visible.sum((2, 3), keepdim=True).clamp_min(1e-6) + 1e-6
 
 
-_LIDS_MM, _LASHES_MM = 3.0, 7.0  # distance from the eye
-_LASHES_PASS = 0.6  # share of light that passes between them
-_GRAZING = 0.15  # least z of a light direction: bounds the length of a shadow
-
-
 @dataclass(frozen=True)
 class HeadFields:
-    """One baked head in UV space, head frame; transport is stored in bytes."""
+    """Baked head in UV space, head frame; transport is stored in bytes."""
 
     positions: Tensor  # [3, T, T], m
     normals: Tensor  # [3, T, T]
@@ -192,7 +198,7 @@ class HeadFields:
 
 
 def head_fields(head: dict[str, Tensor]) -> HeadFields:
-    """Build the fields of one baked head from the tensors of `bake_heads.bake_head`."""
+    """Build the fields of one baked head from the tensors of `heads.bake_head`."""
     side = head["visibility"].shape[-1]
     positions = bake_attributes(head["vertices"], GRID, side)
     normals = normal_map(head["vertices"], grid_triangles(), side)
@@ -225,11 +231,6 @@ def _moved(field: Tensor, by_uv: Tensor, rows: slice) -> Tensor:
     return F.grid_sample(field.expand(len(by_uv), -1, -1, -1), 2 * places - 1, align_corners=False)[:, 0]
 
 
-_FRINGES, _GLASSES = 0.15, 0.08  # share of faces with each
-_BROW_MM = float(LANDMARK_MM[17:27, 1].mean())
-_EYE_MM = (float(abs(LANDMARK_MM[36:48, 0]).mean()), float(LANDMARK_MM[36:48, 1].mean()))
-
-
 def with_occluders(skin: Skin, window: Window, generator: torch.Generator) -> Skin:
     """Cover some of the skins by a fringe or by glasses."""
     count = len(skin.albedo)
@@ -257,7 +258,7 @@ def _covered(skin: Skin, cover: Tensor, albedo: Tensor, roughness: float) -> Ski
 
 
 def _rims(window: Window, width_mm: Tensor, height_mm: Tensor, line_mm: Tensor) -> Tensor:
-    """Cover [B, 1, T, T] of two rims and their bridge; width and height are measured from a rim's centre."""
+    """Return the coverage [B, 1, T, T] of two rims, of given half widths and heights, and their bridge."""
     x, y = places_mm(window)
     dx, dy = x.abs() - _EYE_MM[0], y - _EYE_MM[1] - 2
     radius = ((dx / width_mm) ** 4 + (dy / height_mm) ** 4) ** 0.25  # a rounded rectangle
@@ -265,13 +266,6 @@ def _rims(window: Window, width_mm: Tensor, height_mm: Tensor, line_mm: Tensor) 
     bridge_mm = (dy + 3).abs() + 1e3 * (x.abs() > _EYE_MM[0] - width_mm)
     half_line = line_mm.clamp_min(max(window.texel_mm) / 2)
     return smooth(1.5 - torch.minimum(from_rim_mm, bridge_mm) / half_line)
-
-
-_SAME_POSE_SHARE = 0.6  # share of samples whose target pose is the source pose
-_SOURCE_HIGHLIGHTS = 10  # only the brightest lights of the source have highlights
-_LEAST_POWER = 0.004  # lights of the source below this share of the brightest are skipped
-_LEAST_FACING = 0.1  # cosine to the camera below which a texel has no weight in the loss
-_VIEW_DISTANCE_M = 1.2  # distance of the crop camera from the face
 
 
 def draw_sample(
@@ -305,7 +299,7 @@ def draw_sample(
 
 @dataclass(frozen=True)
 class _FittedView:
-    """One fitted view of a head, from `views.build_views`."""
+    """Fitted view of a head, from `heads.build_views`."""
 
     rotation: Tensor  # [3, 3] head_to_camera
     warp: Tensor  # [T, T, 2] true (u, v) of every fitted texel
@@ -314,7 +308,6 @@ class _FittedView:
 
     @staticmethod
     def draw(views: dict[str, Tensor], generator: torch.Generator) -> "_FittedView":
-        """Draw one of a head's views."""
         index = int(torch.randint(len(views["rotation"]), (), generator=generator))
         return _FittedView(
             rotation=views["rotation"][index],
@@ -326,7 +319,7 @@ class _FittedView:
 
 @dataclass(frozen=True)
 class _LitFace:
-    """One head with its view, source light and target lights; fields [..., T, T] on the true UV map."""
+    """Head with its view, source light and target lights; fields [..., T, T] on the true UV map."""
 
     head: HeadFields
     view: _FittedView

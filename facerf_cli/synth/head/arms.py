@@ -1,7 +1,7 @@
 """Arms of a synthetic person: bent at shoulders and elbows from MakeHuman's resting pose.
 
 Body and garment are bent alike. A point turns about a joint by its share of the angle, which rises along the
-arm, so that shoulders and elbows keep their thickness. Joints are those of MakeHuman's left arm, in
+arm, so that shoulders and elbows keep their thickness. Joints are MakeHuman's, of the left arm, in
 decimetres; the right one is bent in a mirror.
 """
 
@@ -17,10 +17,10 @@ from facerf_cli.synth.random_fields import Random
 NECK_DM = np.array([0.0, 5.95, 0.22])  # origin of the packed meshes
 _SHOULDER, _ELBOW, _WRIST = np.array([[1.68, 5.25, 0.15], [3.13, 3.49, 0.13], [4.31, 2.45, 1.76]])
 _UPPER, _FORE = unit(_ELBOW - _SHOULDER), unit(_WRIST - _ELBOW)
-_BEGIN_DM, _END_DM = 1.2, 2.6  # |x| from which on the arm turns, and beyond which it does so fully
+_BEGIN_DM, _END_DM = 1.2, 2.6  # |x| where the arm begins to turn, and where it turns fully
 _ROUND_DM = (0.9, 1.4)  # distance from the bones within which all is arm, and beyond which nothing is,
 _ASIDE_DM = (2.2, 2.8)  # but for what lies so far aside: wide sleeves
-_BEND_DM = 0.5  # before and after the elbow, over which the forearm begins to turn
+_BEND_DM = 0.5  # the forearm begins to turn this far before the elbow, and turns fully this far after
 # Ranges of the angles in degrees: the arm is lowered, swung forward and twisted inward; the elbow is bent.
 _LOWERED, _FORWARD, _TWISTED, _BENT = (0.0, 42.0), (-12.0, 40.0), (-25.0, 50.0), (-42.0, 60.0)
 _ALIKE_SHARE = 0.4  # of people who hold both arms alike
@@ -53,7 +53,7 @@ def bend_arms(person: HeadMesh, origin_m: np.ndarray, grown: np.ndarray, random:
 
 
 def _draw_pose(random: Random) -> tuple[Rotation, Rotation]:
-    """Turns of the left arm about the shoulder and of its forearm about the elbow."""
+    """Draw turns of the left arm about the shoulder and of its forearm about the elbow."""
     lowered, forward, twisted, bent = (
         np.radians(random.uniform(*ends)) for ends in (_LOWERED, _FORWARD, _TWISTED, _BENT)
     )
@@ -64,7 +64,7 @@ def _draw_pose(random: Random) -> tuple[Rotation, Rotation]:
 
 
 def _bent(places: np.ndarray, shoulder: Rotation, elbow: Rotation) -> np.ndarray:
-    """Places [N, 3] on the left of a resting body, bent."""
+    """Bend points [N, 3] on the left of a resting body."""
     near = np.minimum(_off_bone(places, _SHOULDER, _ELBOW), _off_bone(places, _ELBOW, 2 * _WRIST - _ELBOW))
     is_arm = np.maximum(1 - smoothstep(near, *_ROUND_DM), smoothstep(places[:, 0], *_ASIDE_DM))
     arm = smoothstep(places[:, 0], _BEGIN_DM, _END_DM) * is_arm
@@ -74,11 +74,11 @@ def _bent(places: np.ndarray, shoulder: Rotation, elbow: Rotation) -> np.ndarray
 
 
 def _off_bone(places: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Distance [N] of places [N, 3] from a bone."""
+    """Return the distance [N] of points [N, 3] from a bone."""
     along = np.clip((places - start) @ (end - start) / ((end - start) @ (end - start)), 0, 1)
     return np.asarray(np.linalg.norm(places - start - along[:, None] * (end - start), axis=1))
 
 
 def _turned(places: np.ndarray, joint: np.ndarray, turn: Rotation, share: np.ndarray) -> np.ndarray:
-    """Places [N, 3] turned about a joint by shares [N] of a turn."""
+    """Turn points [N, 3] about a joint by fractions [N] of a turn."""
     return np.asarray(joint + Rotation.from_rotvec(share[:, None] * turn.as_rotvec()).apply(places - joint))

@@ -1,4 +1,4 @@
-"""The upper body below a synthetic head, and a garment on it: MakeHuman's shapes, fitted to the head's neck.
+"""Upper body below a synthetic head, and a garment on it: MakeHuman's shapes, fitted to the head's neck.
 
 The body hangs below the head by the middle of its neck. Where it lies near the skin of the head it is drawn
 to it, so that neck and shoulders are one surface; garments follow the same shift. Cloth is pushed out of the
@@ -37,9 +37,9 @@ _DRAWN_M = 0.02  # standard deviation of the distance to the head's skin up to w
 _NEAR = 4  # vertices of the body that carry a vertex of a garment
 _OVERLAP_M = 0.0025  # larger than the gap between the skins of neck and body
 _OFF_SKIN_M = 0.004  # distance of cloth from skin
-_LIFTED_M = (0.15, 0.08)  # below the chin; further down cloth may lie in the skin, which is left out there
+_LIFTED_M = (0.15, 0.08)  # below the chin; lower down, cloth may lie in the skin, which is left out there
 _UNDER_M = (0.08, 0.05)  # cloth outside of skin, and inside of it, within these distances hides it
-_TOUCH_M = 0.003  # cloth this near to skin hides it, too, if it lies inside
+_TOUCH_M = 0.003  # cloth this near to skin also hides it if it lies inside
 _STRIP_M, _KEPT_M = 0.006, 0.016  # skin shows in places wider than a strip; this far around them it is kept
 _STRAPLESS_SHARE, _STRAPLESS_M = 0.05, 0.13  # of people; upper edge of their top below the neck
 _NECKWEAR_SHARE = 0.15  # of people
@@ -61,7 +61,9 @@ def draw_body(
     skin, faces = packed_mesh(packed + "body")
     skin = skin * grown + origin
     low = (head.is_part("skin")) & (head.vertices[:, 1] < chin - _LOW_M)
-    drawn = _drawn_to(skin, head.vertices[low].astype(float))
+    distance, nearest = cKDTree(head.vertices[low].astype(float)).query(skin)
+    near = np.exp(-((distance / _DRAWN_M) ** 2))[:, None]
+    drawn = near * (head.vertices[low][nearest] - skin)  # to the head's skin
     body = _body_skin(*_refined(skin + drawn, faces, edge_m), head, low)
     strapless = random.random() < _STRAPLESS_SHARE
     name = "tee" if strapless else str(random.choice(WHOLE_GARMENTS if arms else GARMENTS))
@@ -79,39 +81,32 @@ def draw_body(
 
 
 def chin_height_m(head: HeadMesh) -> float:
-    """Height of the underside of the chin, not below `_LOWEST_CHIN_M`."""
+    """Return the height of the underside of the chin, not below `_LOWEST_CHIN_M`."""
     skin = head.is_part("skin")
     nearest = np.linalg.norm(head.uv[skin] - LANDMARK_UV[_CHIN], axis=-1).argmin()
     return max(float(head.vertices[skin][nearest, 1]) - 0.003, _LOWEST_CHIN_M)
 
 
 def clearance_m(person: HeadMesh) -> np.ndarray:
-    """Distance [V] off the surface at which rays must start: neck and body lie closely over each other."""
+    """Return how far [V] off the surface rays must start, since neck and body lie closely over each other."""
     return _OVERLAP_M * (person.label == class_index("neck"))
 
 
 def _neck_depth_m(head: HeadMesh, level_m: float) -> float:
-    """Depth z of the neck's middle at a height."""
+    """Return the depth z of the neck's middle at a height."""
     skin = head.vertices[head.is_part("skin")]
     ring = skin[np.abs(skin[:, 1] - level_m) < 0.006, 2]
     return float(ring.min() + ring.max()) / 2
 
 
-def _drawn_to(points: np.ndarray, skin: np.ndarray) -> np.ndarray:
-    """Shifts [N, 3] that draw points to the skin [M, 3] of the head where they are near it."""
-    distance, nearest = cKDTree(skin).query(points)
-    return np.exp(-((distance / _DRAWN_M) ** 2))[:, None] * (skin[nearest] - points)
-
-
 def _carried(points: np.ndarray, body: np.ndarray, shifts: np.ndarray) -> np.ndarray:
-    """Shifts [N, 3] of points near a body [V, 3] whose vertices are shifted by [V, 3]."""
+    """Return shifts [N, 3] of points near a body [V, 3] whose vertices are shifted by [V, 3]."""
     distance, near = cKDTree(body).query(points, _NEAR)
     weights = 1 / (distance + 1e-4)
     return ((weights / weights.sum(1, keepdims=True))[..., None] * shifts[near]).sum(1)
 
 
 def _refined(vertices: np.ndarray, faces: np.ndarray, edge_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Drop unused vertices and subdivide a mesh."""
     used, faces = np.unique(faces, return_inverse=True)
     vertices, faces = vertices[used], faces.reshape(-1, 3)
     while np.linalg.norm(vertices[faces[:, 0]] - vertices[faces[:, 1]], axis=-1).mean() > edge_m:
@@ -121,7 +116,7 @@ def _refined(vertices: np.ndarray, faces: np.ndarray, edge_m: float) -> tuple[np
 
 
 def _body_skin(vertices: np.ndarray, faces: np.ndarray, head: HeadMesh, low: np.ndarray) -> HeadMesh:
-    """Skin of the body; near that of the head `low` [V] it has the head's normals and lies just under it."""
+    """Build the body's skin, which takes the head's normals and lies just under it near `low` [V]."""
     tree = cKDTree(head.vertices[low].astype(float))
     distance, nearest = tree.query(vertices)
     share = np.exp(-((distance / 0.006) ** 2))[:, None]
@@ -139,7 +134,7 @@ def _body_skin(vertices: np.ndarray, faces: np.ndarray, head: HeadMesh, low: np.
 def _garment(
     vertices: np.ndarray, faces: np.ndarray, body: HeadMesh, head: HeadMesh, low: np.ndarray, chin_m: float
 ) -> HeadMesh:
-    """Cloth that lies outside the skin where that may show."""
+    """Lift cloth off the skin where it may show."""
     points = np.concatenate([body.vertices, head.vertices[low]]).astype(float)
     outward = np.concatenate([body.normals, head.normals[low]]).astype(float)
     tree = cKDTree(points)
@@ -156,7 +151,7 @@ def _garment(
 
 
 def _without_hidden(skin: HeadMesh, garment: HeadMesh, chin: float) -> HeadMesh:
-    """The person without the triangles of low skin that the garment hides."""
+    """Return the person without the triangles of low skin that the garment hides."""
     scene = build_scene(garment.vertices, garment.triangles)
     low = np.flatnonzero((skin.is_part("skin")) & (skin.vertices[:, 1] < chin - _LOW_M))
     points, normals = skin.vertices[low], skin.normals[low]

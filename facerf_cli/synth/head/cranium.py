@@ -1,11 +1,11 @@
-"""The head around the canonical face: skull, sides and neck, which continue any face smoothly.
+"""Head around the canonical face: skull, sides and neck, which continue any face smoothly.
 
 A table of section depths around the vertical axis of the head describes an average head. The depths were
 measured on the ICT-FaceKit mean without ears and shoulders and rounded to half a millimetre; the table holds
 none of its vertices. Kriging carries the difference between the border of a face and the average head
 outward, so that position and slope are continuous across the border and the difference fades over the skull.
 
-A point of the head is given by (u, level). u is that of the face's UV map, continued around the head. level
+A point of the head is given by (u, level). u continues the face's UV map around the head. level
 is v from the upper edge of the UV map (v = 0) down; above that edge it is minus the arc length over the
 crown, in units of the height of the UV map.
 """
@@ -29,13 +29,13 @@ NECK_LEVEL = 1.506  # of the lower end of the neck
 
 _ROUNDING_MM = 0.3  # standard deviation of the table's rounding, which the spline smooths away
 _REACHES_MM = ((55.0, 1.0), (14.0, 0.03))  # (reach, variance) of broad and of small differences at the border
-_RING_STEP, _RING_INSIDE = 4, 5  # every fourth vertex of the border, and of a ring five cells further in
+_RING_STEP, _RING_INSIDE = 4, 5  # every fourth vertex of the border, and of a ring five cells inside it
 _SCALE_LIMITS = (0.85, 1.2)  # of the size of a head, relative to the average head
-_PAD = 6  # cells by which the grid is extended, so that the spline is good up to the border
+_PAD = 6  # the grid is extended by this many cells, to keep the spline good up to the border
 
 
 def average_head_mm(u: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """The average head [..., 3] in millimetres at (u, level) [...]."""
+    """Return the average head [..., 3] in millimetres at (u, level) [...]."""
     azimuth_deg = (u - 0.5) * 2 * HALF_ANGLE_DEG
     length = -level * (TOP_M - BOTTOM_M) * 1000
     across, y = ((s.ev(length, azimuth_deg) + s.ev(length, -azimuth_deg)) / 2 for s in _profiles())
@@ -45,7 +45,7 @@ def average_head_mm(u: np.ndarray, level: np.ndarray) -> np.ndarray:
 
 @cache  # all heads share it
 def _profiles() -> tuple[RectBivariateSpline, RectBivariateSpline]:
-    """Splines of distance from the axis and of height, in mm, over (arc length above `TOP_M`, azimuth)."""
+    """Fit distance from the axis and height, in mm, by splines over (arc length above `TOP_M`, azimuth)."""
     tables = {name: np.array(rows, float) for name, rows in tables_of(__file__).items()}
     crown, sections, half = tables["crown_mm"], tables["sections_mm"], tables["azimuths_deg"]
     top = TOP_M * 1000
@@ -65,7 +65,7 @@ def _profiles() -> tuple[RectBivariateSpline, RectBivariateSpline]:
 
 
 def face_surface(vertices_mm: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Surface [N, 3] of a canonical face at (u, v) [N, 2] in 0..1: a cubic spline through its vertices."""
+    """Interpolate the surface [N, 3] of a canonical face at (u, v) [N, 2] in 0..1 by a cubic spline."""
     grid = vertices_mm.reshape(GRID, GRID, 3)
     padded = np.pad(grid, ((_PAD, _PAD), (_PAD, _PAD), (0, 0)), "reflect", reflect_type="odd")
     at = np.stack([uv[:, 1], uv[:, 0]]) * (GRID - 1) + _PAD
@@ -73,7 +73,7 @@ def face_surface(vertices_mm: np.ndarray, uv: np.ndarray) -> np.ndarray:
 
 
 class Surroundings:
-    """The head outside the face at fixed (u, level) [N, 2], for many faces."""
+    """Head outside the face at fixed (u, level) [N, 2], for many faces."""
 
     def __init__(self, u_level: np.ndarray) -> None:
         uv = grid_uv().double().numpy()
@@ -87,7 +87,7 @@ class Surroundings:
             self._carry = torch.cat([(torch.from_numpy(_kernel(c, known)) @ inverse).float() for c in chunks])
 
     def positions(self, vertices_mm: np.ndarray) -> np.ndarray:
-        """The surface [N, 3] in millimetres that continues the face `vertices_mm` [V, 3]."""
+        """Return the surface [N, 3] in millimetres that continues the face `vertices_mm` [V, 3]."""
         border = vertices_mm[self._rings]
         scale, shift = _similarity(self._known, border)
         difference = border - (self._known * scale + shift)
@@ -97,7 +97,7 @@ class Surroundings:
 
 
 def _rings() -> np.ndarray:
-    """Ids [R] of face vertices along the border and along a ring inside it."""
+    """Return ids [R] of face vertices along the border and along a ring inside it."""
     rows = []
     for inside in (0, _RING_INSIDE):
         near, far = inside, GRID - 1 - inside

@@ -18,14 +18,14 @@ GLASSES = tuple(_LENSES)
 
 _EYES = ((36, 39), (42, 45))  # landmarks of the corners
 _GAP_M = 0.0012  # between frame and skin
-_NEAR_M = 0.003  # radius around a point in which skin counts
+_NEAR_M = 0.003  # skin within this radius of a point counts
 _TUBE = 10  # vertices around a tube
 _LENS_RADIUS_M, _LENS_RINGS = 0.12, 5  # of the sphere whose cap a lens is
 
 
 @dataclass(frozen=True, eq=False)
 class Glasses:
-    """A frame, as part "frame", and lenses, which are transparent and so no part of the head's mesh."""
+    """Frame, as part "frame", and lenses, which are transparent and so no part of the head's mesh."""
 
     frame: HeadMesh
     lenses: HeadMesh
@@ -54,7 +54,7 @@ def draw_glasses(head: HeadMesh, landmarks_m: np.ndarray, random: Random) -> Gla
 
 
 def _lens(rim: np.ndarray) -> HeadMesh:
-    """The front of a lens in its rim [64, 3]: a cap of a sphere."""
+    """Return the front of a lens in its rim [64, 3]: a cap of a sphere."""
     count, centre = len(rim), rim.mean(0)
     axis = np.linalg.svd(rim - centre)[2][2]
     axis = axis * np.sign(axis[2])
@@ -70,7 +70,7 @@ def _lens(rim: np.ndarray) -> HeadMesh:
 
 
 class _HeadSurface:
-    """The outermost skin and eyes of a head along the z or the x axis."""
+    """Outermost skin and eyes of a head along the z or the x axis."""
 
     def __init__(self, head: HeadMesh) -> None:
         outer = head.is_part("skin", "eye")
@@ -91,7 +91,7 @@ class _HeadSurface:
         return _greatest(*self._sides[side], points[:, 1:])
 
     def ear_top(self, side: int) -> tuple[float, float]:
-        """(y, z) just above the ear: the first height, from the temple down, at which the head juts out."""
+        """Find (y, z) just above the ear: the first height, from the temple down, where the head juts out."""
         heights = np.arange(0.062, 0.015, -0.002)
         z = np.arange(-0.015, 0.026, 0.003)
         points = np.stack(np.broadcast_arrays(0, heights[:, None], z), -1).reshape(-1, 3)
@@ -104,7 +104,7 @@ class _HeadSurface:
 
 
 def _greatest(tree: cKDTree, values: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """The greatest of `values` within `_NEAR_M` of each place [N, 2]; if there is none, the nearest one."""
+    """Return the greatest of `values` within `_NEAR_M` of each place [N, 2], or else the nearest one."""
     _, nearest = tree.query(at)
     return np.array(
         [
@@ -141,7 +141,7 @@ def _rims(kind: str, landmarks_m: np.ndarray, random: Random) -> list[np.ndarray
 def _settled(
     rims: list[np.ndarray], surface: _HeadSurface, landmarks_m: np.ndarray, clear_m: float
 ) -> list[np.ndarray]:
-    """Rims moved in front of the face, as near as skin, lashes and the bridge of the nose allow."""
+    """Move rims in front of the face, as near as skin, lashes and the bridge of the nose allow."""
     need = max(float((surface.front(rim) + clear_m - rim[:, 2]).max()) for rim in rims)
     eyes = landmarks_m[np.arange(36, 48), 2].max() + 0.009  # room for the lashes
     need = max(need, eyes - float(np.mean([rim[:, 2].mean() for rim in rims])))
@@ -149,7 +149,7 @@ def _settled(
 
 
 def _upper(rim: np.ndarray) -> np.ndarray:
-    """The part of a rim that half-rim glasses have: its upper half, and a little down both sides."""
+    """Return the part of a rim that half-rim glasses have: its upper half, and a little down both sides."""
     order = np.roll(rim, 4, 0)
     return order[: len(rim) // 2 + 8]
 
@@ -157,7 +157,7 @@ def _upper(rim: np.ndarray) -> np.ndarray:
 def _bridge(
     rims: list[np.ndarray], surface: _HeadSurface, width: float, depth: float, level: float
 ) -> HeadMesh:
-    """A bar from rim to rim over the nose, at `level` (0..1) from the middle of the rims to their top."""
+    """Build a bar from rim to rim over the nose, at `level` (0..1) from the rims' middle to their top."""
     ends = []
     for rim in rims:
         inner = rim[np.argsort(np.abs(rim[:, 0]))[: len(rim) // 3]]
@@ -175,7 +175,7 @@ def _bridge(
 
 
 def _temple(rim: np.ndarray, surface: _HeadSurface, thick: float, high: float) -> HeadMesh:
-    """A bar from the outer end of a rim along the head to the ear, and a little behind it."""
+    """Build a bar from the outer end of a rim along the head to the ear, and a little behind it."""
     side = int(np.sign(rim[:, 0].mean()))
     outer = rim[np.argsort(-np.abs(rim[:, 0]))[:20]]
     level = rim[:, 1].mean() + 0.35 * np.ptp(rim[:, 1]) / 2

@@ -32,13 +32,22 @@ from facerf_cli.synth.head.mesh import (
 from facerf_cli.synth.head.worn import Headwear
 from facerf_cli.synth.random_fields import CANVAS_SPAN, Random, Window
 
-MAX_VERTICES = 250_000  # of all hair; further wisps are dropped
+MAX_VERTICES = 250_000  # of all hair; more wisps are dropped
 
-_FACE_DEG = 50.0  # largest azimuth at which hair below the fringe covers the face
+_FACE_DEG = 50.0  # hair below the fringe covers the face up to this azimuth
+_CROWN_M = np.array([0, 0.145, -0.01])  # thinning is strongest here and in front of it
 _CHIN_M = -0.13  # hair below this height no longer covers the face
 _RAGGED_M = 0.002  # standard deviation of the hairline's height
 _RAGGED_FRINGE_M, _FRINGE_LOCKS = 0.005, 400  # deviation of a fringe's edge; locks of all hair
 _SHORTEST_STEP_M = 1e-4  # of a wisp
+_BEARD = HairStyle(name="beard", comb="whorl", segments=5, width_mm=0.6)
+_LASHES = HairStyle(name="lashes", comb="whorl", segments=4, width_mm=0.22)
+_WISPS = 7000  # of a full beard
+_MOUTH_V = float(LANDMARK_UV[48:60, 1].mean())
+_LIP_M = 0.034  # half width of a moustache
+_LEAST_COVER = 0.15  # of a beard that has length
+_LIDS = (((36, 37, 38, 39), 110), ((39, 40, 41, 36), 60), ((42, 43, 44, 45), 110), ((45, 46, 47, 42), 60))
+_LASH_M = {110: 0.009, 60: 0.0055}  # length of upper and lower lashes, by their number
 
 
 def draw_hair(
@@ -54,9 +63,9 @@ def draw_hair(
 
 
 def grow_hair(head: HeadMesh, style: HairStyle, random: Random) -> HeadMesh:
-    """Grow the hair alone, as part "hair"; without vertices if the style has none.
+    """Grow only the hair, as part "hair"; without vertices if the style has none.
 
-    Normals are those of a soft volume and not of the ribbons. uv: a random number of the wisp, and the
+    Normals belong to a soft volume and not to the ribbons. uv: a random number of the wisp, and the
     position from root (0) to tip (1).
     """
     roots, root_normals, margin = _roots(head, style, random)
@@ -87,7 +96,6 @@ def grow_hair(head: HeadMesh, style: HairStyle, random: Random) -> HeadMesh:
 
 
 def _tail(head: HeadMesh, style: HairStyle, hull: Hull, random: Random) -> HeadMesh:
-    """Grow the ponytail, bun or braids of a style."""
     paths, normals = tail_paths(style.tail, head.vertices, hull, style.knot_mm / 1000, random)
     shape = replace(style, segments=ROWS - 1, crowding=1.0)
     return ribbons(paths, normals, normals[:, 0], shape, random)
@@ -101,20 +109,15 @@ def _roots(head: HeadMesh, style: HairStyle, random: Random) -> tuple[np.ndarray
     margin = scalp_margin_m(centre, style)
     ragged = margin + random.normal(0, _RAGGED_M, len(margin))
     chance = doubled_areas(corners) * np.clip(ragged / 0.007 + 0.25, 0, 1) ** 1.5
-    chance = chance * (1 - style.thinning * _bare_top(centre))
+    from_crown_m = np.linalg.norm((centre - _CROWN_M) * [1, 1, 0.8], axis=-1)
+    bare = 0.97 * np.clip((0.075 - from_crown_m) / 0.025, 0, 1)
+    chance = chance * (1 - style.thinning * bare)
     if style.comb == "parted":  # a parting shows its roots, so it needs more of them
         chance = chance * (1 + 3 * np.exp(-(((centre[:, 0] - style.parting_mm / 1000) / 0.008) ** 2)))
     if not style.wisps or not chance.any():
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
     roots, normals, chosen = drawn_places(head, triangles, chance, style.wisps, random)
     return roots, normals, margin[chosen]
-
-
-def _bare_top(points: np.ndarray) -> np.ndarray:
-    """Strength [N] in 0..1 of the thinning of hair: high at the crown and in front of it."""
-    crown = np.array([0, 0.145, -0.01])
-    distance = np.linalg.norm((points - crown) * [1, 1, 0.8], axis=-1)
-    return 0.97 * np.clip((0.075 - distance) / 0.025, 0, 1)
 
 
 def _lengths(roots: np.ndarray, margin: np.ndarray, style: HairStyle, random: Random) -> np.ndarray:
@@ -166,7 +169,7 @@ class _Wisps:
         return np.stack(rows, 1)
 
     def _in_layer(self, points: np.ndarray, share: float, length_m: np.ndarray) -> np.ndarray:
-        """Points [W, 3] kept above the skin, and on the skull inside the layer of the wisp."""
+        """Return points [W, 3] kept above the skin, and on the skull inside the layer of the wisp."""
         rise = np.minimum(self.layer_m, 0.6 * share * length_m)
         least = 0.6 * rise if self.style.comb != "out" else np.minimum(rise, 0.002)
         points = self.hull.lifted(points, least)
@@ -211,7 +214,7 @@ def _combed(points: np.ndarray, normals: np.ndarray, roots: np.ndarray, style: H
 
 
 def _ragged(roots: np.ndarray, style: HairStyle, random: Random) -> np.ndarray:
-    """Draw how much lower or higher the wisps [W] of a fringe end: lock by lock, and each alone."""
+    """Draw how much lower or higher the wisps [W] of a fringe end: lock by lock, and each by itself."""
     locks = roots[random.choice(len(roots), min(len(roots), _FRINGE_LOCKS), replace=False)]
     lock = cKDTree(locks).query(roots)[1]
     return _RAGGED_FRINGE_M * (random.normal(0, 1, len(locks))[lock] + random.normal(0, 0.6, len(roots)))
@@ -226,13 +229,13 @@ def _covers_face(paths: np.ndarray, style: HairStyle, ragged_m: np.ndarray) -> n
 
 
 def _leaders(roots: np.ndarray, style: HairStyle, random: Random) -> np.ndarray:
-    """Index [W] of the wisp that leads each wisp's clump: the nearest leader on the scalp."""
+    """Return the index [W] of the wisp that leads each wisp's clump: the nearest leader on the scalp."""
     leaders = random.choice(len(roots), max(1, len(roots) // style.clump_wisps), replace=False)
     return leaders[cKDTree(roots[leaders]).query(roots)[1]]
 
 
 def _clumped(paths: np.ndarray, leader: np.ndarray, style: HairStyle, random: Random) -> np.ndarray:
-    """Paths drawn toward the leader of their clump, increasingly toward the tip."""
+    """Draw paths toward the leader of their clump, increasingly toward the tip."""
     share = _shares(style)
     pull = style.clump * random.uniform(0.3, 1, len(paths))[:, None] * share**0.8
     apart = paths[leader] - paths
@@ -249,7 +252,7 @@ def _curled(
     style: HairStyle,
     random: Random,
 ) -> np.ndarray:
-    """Paths wound into helices, with some random frizz."""
+    """Wind paths into helices, with some random frizz."""
     along = _tangents(paths)
     across = np.cross(along, normals)
     share = _shares(style)
@@ -303,26 +306,11 @@ def ribbons(
 
 
 def _ribbon_triangles(wisps: int, rows: int) -> np.ndarray:
-    """Triangles [F, 3] of ribbons with two vertices per row and one at the tip."""
+    """Return triangles [F, 3] of ribbons with two vertices per row and one at the tip."""
     first = np.arange(rows - 2)[:, None] * 2
     quads = np.concatenate([first + np.array([0, 1, 2]), first + np.array([1, 3, 2])])
     strip = np.concatenate([quads, [[2 * rows - 4, 2 * rows - 3, 2 * rows - 2]]])
     return (strip + np.arange(wisps)[:, None, None] * (2 * rows - 1)).reshape(-1, 3).astype(np.int64)
-
-
-_BEARD = HairStyle(name="beard", comb="whorl", segments=5, width_mm=0.6)
-_LASHES = HairStyle(name="lashes", comb="whorl", segments=4, width_mm=0.22)
-_WISPS = 7000  # of a full beard
-_MOUTH_V = float(LANDMARK_UV[48:60, 1].mean())
-_LIP_M = 0.034  # half width of a moustache
-_LEAST_COVER = 0.15  # of a beard that has length
-_LIDS = (((36, 37, 38, 39), 110), ((39, 40, 41, 36), 60), ((42, 43, 44, 45), 110), ((45, 46, 47, 42), 60))
-_LASH_M = {110: 0.009, 60: 0.0055}  # length of upper and lower lashes, by their number
-
-
-def _density() -> np.ndarray:
-    """Density [T, T] of a beard over the canvas."""
-    return np.asarray(beard_density(Window(256, CANVAS_SPAN))[0, 0].numpy())
 
 
 def grow_beard(head: HeadMesh, traits: dict[str, float | str | bool], random: Random) -> HeadMesh | None:
@@ -339,7 +327,8 @@ def grow_beard(head: HeadMesh, traits: dict[str, float | str | bool], random: Ra
     cover = np.where(on_lip, moustache, beard)
     if float(traits["goatee"]):
         cover = cover * smoothstep(0.042 - np.abs(centre[:, 0]), 0, 0.012)
-    chance = doubled_areas(corners) * _density()[place[:, 1], place[:, 0]] ** 1.3 * cover
+    density = beard_density(Window(256, CANVAS_SPAN))[0, 0].numpy()
+    chance = doubled_areas(corners) * density[place[:, 1], place[:, 0]] ** 1.3 * cover
     if chance.sum() <= 0:
         return None
     count = int(_WISPS * max(beard, 0.35 * moustache))

@@ -23,6 +23,12 @@ _LINE_M = (0, 0.001, 0.004, -0.003, -0.022, -0.040, -0.058, -0.076, -0.078)
 _LINE_EAR_M = (0.046, 0.048, 0.043, 0.022, -0.018, -0.052, -0.066, -0.068)
 _RECEDES = (0.0, 0.35, 1.0, 1.0, 0.6, 0.3, 0.1, 0, 0)  # fraction of `recession_mm` at the first azimuths
 _MEAN_FOREHEAD_M = 0.096
+ROWS = 17  # points of a path
+_WISPS = {"ponytail": 1300, "bun": 900, "braids": 1400}
+_BRAIDS_M = np.array([0.072, -0.035, -0.012])  # begin of the braid on the image's right: below the ear
+_BACK_M = 0.09  # from the middle of the skull to its back
+_SHOULDER_M = -0.105  # below this height a braid lies on the clothes
+_STRAND_M = 0.007  # half width of a strand of a braid
 
 
 @dataclass(frozen=True)
@@ -41,10 +47,10 @@ class HairStyle:
     width_mm: float = 1.0  # of a wisp
     layer_mm: float = 10.0  # thickness of the hair over the skull
     crowding: float = 1.0  # above 1, the rows of a wisp lie closer near the root
-    lift: float = 0.6  # strength by which hair stands off at the root
+    lift: float = 0.6  # how strongly hair stands off at the root
     gravity: float = 0.6
     stray: float = 0.16  # deviation of single wisps from the combing direction
-    clump: float = 0.5  # strength by which wisps of a clump draw together
+    clump: float = 0.5  # how strongly wisps of a clump draw together
     clump_wisps: int = 14  # per clump
     curl_mm: float = 0.5  # radius of the curl
     wave_mm: float = 40.0  # length of one turn of the curl along the wisp
@@ -52,7 +58,7 @@ class HairStyle:
     forehead_mm: float = 96.0  # height of the hairline above the underside of the nose
     recession_mm: float = 4.0  # of the hairline at the temples
     thinning: float = 0.0  # of the crown and behind the forehead
-    fringe_mm: float = 75.0  # height at which hair in front of the forehead ends
+    fringe_mm: float = 75.0  # hair in front of the forehead ends at this height
     parting_mm: float = 30.0  # offset of the parting from the midline, to the right of the image
     tuck: float = 0.0  # 1: behind the ears
 
@@ -93,7 +99,7 @@ def draw_style(random: Random, name: str | None = None) -> HairStyle:
 
 
 def scalp_margin_m(points: np.ndarray, style: HairStyle) -> np.ndarray:
-    """Height [...] in metres of skin points [..., 3] above the style's hairline; negative below it."""
+    """Return the height [...] in metres of skin points [..., 3] above the style's hairline."""
     azimuth = np.abs(np.degrees(np.arctan2(points[..., 0], points[..., 2])))
     first = np.array(_LINE_M) + style.forehead_mm / 1000 + np.array(_RECEDES) * style.recession_mm / 1000
     fixed = np.array(_LINE_M) + _MEAN_FOREHEAD_M  # the style does not move temples and sideburns
@@ -102,7 +108,7 @@ def scalp_margin_m(points: np.ndarray, style: HairStyle) -> np.ndarray:
 
 
 def scalp_cover(uv: np.ndarray, style: HairStyle) -> np.ndarray:
-    """Cover [...] in 0..1 of the skin by hair at (u, v) [..., 2] of the UV map, which may lie outside 0..1.
+    """Return the coverage [...] of the skin by hair at (u, v) [..., 2], which may lie outside 0..1.
 
     A skin texture stained with it hides the scalp that shows between the wisps.
     """
@@ -113,16 +119,8 @@ def scalp_cover(uv: np.ndarray, style: HairStyle) -> np.ndarray:
     return cover * np.where(np.abs(azimuth) < np.pi, 1 - 0.7 * style.thinning * (y > 0.1), 0)
 
 
-ROWS = 17  # points of a path
-_WISPS = {"ponytail": 1300, "bun": 900, "braids": 1400}
-_BRAIDS_M = np.array([0.072, -0.035, -0.012])  # begin of the braid on the image's right: below the ear
-_BACK_M = 0.09  # from the middle of the skull to its back
-_SHOULDER_M = -0.105  # height from which on a braid lies on the clothes
-_STRAND_M = 0.007  # half width of a strand of a braid
-
-
 def knot_m(hull: Hull, height_m: float) -> np.ndarray:
-    """The place [3] at the back of the head, at this height, to which hair is combed."""
+    """Return the point [3] at the back of the head, at this height, that hair is combed to."""
     far = hull.middle + 5 * np.array([0.0, max(height_m - hull.middle[1], 0.0), -_BACK_M])
     far[1] += min(height_m - hull.middle[1], 0.0)
     return np.asarray(far - (hull.height(far[None])[0] - 0.004) * hull.rays(far[None])[0])
@@ -133,7 +131,7 @@ def tail_paths(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw paths and normals [W, ROWS, 3] of a ponytail, a bun or two braids.
 
-    person_m [V, 3]: head and clothes, over which braids hang.
+    person_m [V, 3]: head and clothes under the braids.
     """
     count = _WISPS[kind]
     share = np.linspace(0, 1, ROWS)[None, :, None]
@@ -190,7 +188,7 @@ def _across(axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def tied(paths: np.ndarray, hull: Hull, height_m: float, layer_m: float) -> np.ndarray:
-    """Paths [W, R, 3] that lie on the head and end in the knot, with as many points as before."""
+    """Return paths [W, R, 3] that lie on the head and end in the knot, with as many points as before."""
     knot, rows = knot_m(hull, height_m), paths.shape[1]
     last = np.maximum(np.linalg.norm(paths - knot, axis=-1).argmin(1), 1)
     at = np.linspace(0, 1, rows) * last[:, None]

@@ -38,11 +38,40 @@ CLASS_OF_PART = {
 PARTS = tuple(CLASS_OF_PART)
 _OF_VERTICES = ("vertices", "normals", "part", "uv", "tangents", "label")  # fields of HeadMesh
 CLOTH_M = 0.5  # size of the texture of cloth
+# Lower edge of the face on the mean head: height in metres at an azimuth in degrees, the same on both sides.
+# It follows the jaw to the lobe of the ear, then the nape below the hair.
+_JAW_DEG = (0, 15, 27, 38, 50, 65, 80, 95, 110, 180)
+_JAW_M = (-0.0755, -0.072, -0.064, -0.053, -0.046, -0.042, -0.041, -0.046, -0.05, -0.058)
+_MARGIN_UV = 0.02  # around the landmarks, within which features of the face are looked for
+_AZIMUTHS = 96
+_ARC_M = 0.004  # height of a cell
+HULL_RADIUS_M = 0.09  # arc per radian of elevation
+_LOWEST_M = -0.36  # arc of the lowest row
+_MIDDLE_M = 0.045  # height of the capsule's middle: the widest part of the skull, above the ears
+_SLICE_M = (0.07, 0.09)  # front and back of the skull are measured between these heights
+_STEP_M = 0.002  # for slopes of the field
+_SMOOTH_CELLS = 0.8  # sigma of the Gaussian that smooths the field
+MAKEHUMAN_LICENCE = "bodies and clothes: CC0 1.0 (MakeHuman)"
+STEP_M = 2e-5  # unit of the stored coordinates
+WHOLE = "whole "  # before the names of body and garments that reach to hips and hands
+GARMENTS = (
+    "tee",
+    "loose tee",
+    "v-neck",
+    "round neck",
+    "blouse",
+    "sweater",
+    "polo",
+    "shirt",
+    "jacket",
+    "suit",
+)
+WHOLE_GARMENTS = tuple(name for name in GARMENTS if name != "v-neck")  # which ends at the waist
 
 
 @dataclass(frozen=True, eq=False)
 class HeadMesh:
-    """A head with its hair, clothes and glasses, in the head frame (`face.topology`), metres, float32.
+    """Head with its hair, clothes and glasses, in the head frame (`face.topology`), metres, float32.
 
     vertices, normals (unit) [V, 3]; triangles [F, 3] int64, counter-clockwise seen from outside, each within
     one part; part [V] uint8, an index into `PARTS`; uv [V, 2] in the texture of the part, row v = 0 at the
@@ -63,12 +92,11 @@ class HeadMesh:
         return np.isin(self.part, [PARTS.index(part) for part in parts])
 
     def faces_of(self, *parts: str) -> np.ndarray:
-        """Triangles [F, 3] of some parts."""
+        """Return triangles [F, 3] of some parts."""
         return self.triangles[self.is_part(*parts)[self.triangles[:, 0]]]
 
 
 def joined(*meshes: HeadMesh) -> HeadMesh:
-    """Concatenate several meshes into one."""
     offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     triangles = [mesh.triangles + offset for mesh, offset in zip(meshes, offsets, strict=True)]
     of_vertices = {name: np.concatenate([getattr(mesh, name) for mesh in meshes]) for name in _OF_VERTICES}
@@ -102,7 +130,7 @@ def kept_triangles(mesh: HeadMesh, kept: np.ndarray) -> HeadMesh:
 
 
 def ring_triangles(rings: int, segments: int) -> np.ndarray:
-    """Triangles [F, 3] between closed rings of vertices.
+    """Return triangles [F, 3] between closed rings of vertices.
 
     They are counter-clockwise for a viewer who sees each ring counter-clockwise, and the next ring behind
     and around it.
@@ -169,12 +197,12 @@ def drawn_places(
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
-    """Vectors [..., 3] scaled to length 1; a zero vector stays zero."""
+    """Scale vectors [..., 3] to length 1; a zero vector stays zero."""
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12))
 
 
 def smoothstep(value: np.ndarray, start: float = 0.0, end: float = 1.0) -> np.ndarray:
-    """0 at and before `start`, 1 at and beyond `end`, a smooth cubic in between."""
+    """Return 0 at and before `start`, 1 at and beyond `end`, a smooth cubic in between."""
     fraction = np.clip((value - start) / (end - start), 0, 1)
     return np.asarray(fraction * fraction * (3 - 2 * fraction))
 
@@ -184,15 +212,8 @@ def arc_lengths(points: np.ndarray) -> np.ndarray:
     return np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=-1))])
 
 
-# Lower edge of the face on the mean head: height in metres at an azimuth in degrees, the same on both sides.
-# It follows the jaw to the lobe of the ear, then the nape below the hair.
-_JAW_DEG = (0, 15, 27, 38, 50, 65, 80, 95, 110, 180)
-_JAW_M = (-0.0755, -0.072, -0.064, -0.053, -0.046, -0.042, -0.041, -0.046, -0.05, -0.058)
-_MARGIN_UV = 0.02  # around the landmarks, within which features of the face are looked for
-
-
 def part_class(part: str) -> int:
-    """Class that all of a part has, unless its builder says otherwise."""
+    """Return the class that all of a part has, unless its builder says otherwise."""
     return class_index(CLASS_OF_PART[part])
 
 
@@ -211,7 +232,7 @@ def skin_classes(uv: np.ndarray) -> np.ndarray:
 
 
 def loop_step(triangles: np.ndarray, count: int) -> tuple[csr_matrix, np.ndarray]:
-    """One step of Loop's subdivision for triangles [F, 3] of `count` vertices.
+    """Compute one step of Loop's subdivision for triangles [F, 3] of `count` vertices.
 
     Returns the matrix [count + E, count] from old to new vertices (the old ones first, then one per edge)
     and the new triangles [4 F, 3]. Vertices of no triangle stay; a border is smoothed as a separate curve.
@@ -264,25 +285,15 @@ def _old_vertices(
     ]
 
 
-_AZIMUTHS = 96
-_ARC_M = 0.004  # height of a cell
-HULL_RADIUS_M = 0.09  # arc per radian of elevation
-_LOWEST_M = -0.36  # arc of the lowest row
-_MIDDLE_M = 0.045  # height of the capsule's middle: the widest part of the skull, above the ears
-_SLICE_M = (0.07, 0.09)  # range of heights in which front and back of the skull are measured
-_STEP_M = 0.002  # step over which the slope of the field is measured
-_SMOOTH_CELLS = 0.8  # sigma of the Gaussian that smooths the field
-
-
 @dataclass(frozen=True, eq=False)
 class Hull:
-    """Radius [rows, azimuths] in metres of the outermost surface around `middle` [3]; smooth and closed."""
+    """Smooth closed surface around a head: its radius [rows, azimuths] in metres around `middle` [3]."""
 
     middle: np.ndarray
     radius: np.ndarray
 
     def height(self, points: np.ndarray) -> np.ndarray:
-        """Distance [...] of points [..., 3] outside the hull, along the capsule's ray; negative inside."""
+        """Return the distance [...] of points [..., 3] from the hull, along its ray; negative inside."""
         out, azimuth, arc = self._coordinates(points)
         column = azimuth / (2 * np.pi) * _AZIMUTHS
         row = np.clip((arc - _LOWEST_M) / _ARC_M, 0, len(self.radius) - 1)
@@ -290,7 +301,7 @@ class Hull:
         return out - map_coordinates(padded, [row, column % _AZIMUTHS], order=1, mode="nearest")
 
     def rays(self, points: np.ndarray) -> np.ndarray:
-        """The unit direction [..., 3] in which the height of points [..., 3] is measured."""
+        """Return the unit direction [..., 3] along which `height` measures points [..., 3]."""
         offset = points - self.middle
         offset = np.stack([offset[..., 0], np.maximum(offset[..., 1], 0), offset[..., 2]], -1)
         return unit(offset)
@@ -302,7 +313,7 @@ class Hull:
         return unit(slope)
 
     def lifted(self, points: np.ndarray, least: np.ndarray | float) -> np.ndarray:
-        """Points [..., 3] after those lower than `least` [...] are pushed out to that height."""
+        """Return points [..., 3] after those lower than `least` [...] are pushed out to that height."""
         short = np.maximum(least - self.height(points), 0)
         return points + short[..., None] * self.rays(points)
 
@@ -332,7 +343,7 @@ def hull_of(head: HeadMesh) -> Hull:
 
 
 def _middle(points: np.ndarray) -> np.ndarray:
-    """The capsule's middle [3], halfway between the forehead and the back of the skull."""
+    """Return the capsule's middle [3], halfway between the forehead and the back of the skull."""
     belt = points[(points[:, 1] > _SLICE_M[0]) & (points[:, 1] < _SLICE_M[1])]
     return np.array([0, _MIDDLE_M, (belt[:, 2].min() + belt[:, 2].max()) / 2])
 
@@ -345,26 +356,8 @@ def _filled(radius: np.ndarray) -> np.ndarray:
     return tiled[tuple(nearest)][:, third : 2 * third]
 
 
-MAKEHUMAN_LICENCE = "bodies and clothes: CC0 1.0 (MakeHuman)"
-STEP_M = 2e-5  # unit of the stored coordinates
-WHOLE = "whole "  # before the names of body and garments that reach to hips and hands
-GARMENTS = (
-    "tee",
-    "loose tee",
-    "v-neck",
-    "round neck",
-    "blouse",
-    "sweater",
-    "polo",
-    "shirt",
-    "jacket",
-    "suit",
-)
-WHOLE_GARMENTS = tuple(name for name in GARMENTS if name != "v-neck")  # which ends at the waist
-
-
 def packed_mesh(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3] (m, the middle of the neck at the origin) and triangles [F, 3] of a packed shape."""
+    """Read vertices [V, 3] (m, from the middle of the neck) and triangles [F, 3] of a packed shape."""
     tensors = _tensors()
     vertices = tensors[f"{name}.vertices"].astype(np.float64) * STEP_M
     return vertices, tensors[f"{name}.triangles"].astype(np.int64)

@@ -1,4 +1,4 @@
-"""The inside of an open mouth: a dark bag behind the lips, teeth, gums and tongue, in millimetres."""
+"""Inside of an open mouth: a dark bag behind the lips, teeth, gums and tongue, in millimetres."""
 
 from collections.abc import Callable
 
@@ -13,7 +13,7 @@ from facerf_cli.synth.head.mesh import arc_lengths, capped, ring_triangles, unit
 _TABLES = tables_of(__file__)
 _ARCH_HALF_MM, _ARCH_DEPTH_MM = 27.0, 38.0  # half width and depth of the arch of a row
 _EDGE_MM = np.array([0.0, -35.0, 117.0])  # edge of the upper incisors in the average head
-_OVERLAP_MM, _OVERJET_MM = 2.0, 2.2  # by which the upper incisors lie below and in front of the lower ones
+_OVERLAP_MM, _OVERJET_MM = 2.0, 2.2  # of the upper incisors, below and in front of the lower ones
 _HINGE_MM = np.array([0.0, 12.0, 25.0])  # axis of the jaw
 _STEADY = (27, 28, 29, 30, 33, 36, 39, 42, 45)  # landmarks that expressions hardly move
 _LIP_MM = 0.8  # between the inner rim of the lips and the teeth
@@ -25,7 +25,7 @@ _TONGUE_MM, _TONGUE_HALF_MM = np.array([0, -6.0, -31.0]), np.array([18.0, 6.5, 2
 
 
 def bag(rim: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A bag behind the inner rim of the lips [N, 3] (in order): vertices, triangles seen from inside, uv."""
+    """Build a bag behind the lips' inner rim [N, 3] (in order): vertices, triangles seen from inside, uv."""
     centre = rim.mean(0)
     offset = rim - centre
     reach = np.maximum(np.abs(offset[:, :2]).max(0), 1.0)
@@ -63,7 +63,7 @@ def teeth(landmarks_mm: np.ndarray, rim: np.ndarray) -> tuple[np.ndarray, np.nda
 def gums_and_tongue(
     landmarks_mm: np.ndarray, rim: np.ndarray
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """The gums of both rows of teeth, and the tongue behind the lower row, each in the form of `teeth`."""
+    """Build the gums of both rows, and the tongue behind the lower one, each in the form of `teeth`."""
     upper, lower = _placements(landmarks_mm, rim)
     triangles, uv = capped(_GUM_RINGS, _GUM_SEGMENTS), _ring_uv(_GUM_RINGS, _GUM_SEGMENTS)
     gums = [(upper(_ridge(1.0)), triangles[:, ::-1], uv), (lower(_ridge(-1.0)), triangles, uv)]
@@ -118,18 +118,18 @@ def _skull(landmarks_mm: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
 def _jaw(
     landmarks_mm: np.ndarray, scale: float, turn: np.ndarray, shift: np.ndarray
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """The rotation of the jaw around its hinge that explains how far chin and lower lip have moved down."""
-    found = (landmarks_mm - shift) @ turn / scale
-    chin = LANDMARKS_M[8, 1] * 1000 - found[8, 1]
-    parted = found[[61, 62, 63], 1].mean() - found[[67, 66, 65], 1].mean() - 2
+    """Return the rotation of the jaw around its hinge that lowers chin and lower lip to where they are."""
+    own_mm = (landmarks_mm - shift) @ turn / scale
+    chin = LANDMARKS_M[8, 1] * 1000 - own_mm[8, 1]
+    parted = own_mm[[61, 62, 63], 1].mean() - own_mm[[67, 66, 65], 1].mean() - 2
     drop = np.clip(min(chin + _CHIN_DOUBT_MM, parted), 0, 40)
     angle = drop / np.linalg.norm((_EDGE_MM - _HINGE_MM)[1:])
-    jaw, aside = Rotation.from_rotvec([angle, 0, 0]), np.array([found[6:11, 0].mean(), 0, 0])
+    jaw, aside = Rotation.from_rotvec([angle, 0, 0]), np.array([own_mm[6:11, 0].mean(), 0, 0])
     return lambda points: _HINGE_MM + jaw.apply(points - _HINGE_MM) + aside
 
 
 def _too_near(row: np.ndarray, lip: np.ndarray) -> float:
-    """Distance by which a row must move back to stay behind the inner rim [N, 3] of a lip."""
+    """Return how far a row must move back to stay behind the inner rim [N, 3] of a lip."""
     middle = lip[np.abs(lip[:, 0] - lip[:, 0].mean()) < 0.25 * np.ptp(lip[:, 0])]
     front = row[:, 2].max()
     return float(max(front + _LIP_MM - middle[:, 2].min(), 0))
@@ -144,7 +144,7 @@ def _arch() -> tuple[CubicSpline, float]:
 
 
 def _ridge(up: float) -> np.ndarray:
-    """A gum [V, 3] along the whole arch, with tapered ends; `up`: 1 for the upper row, -1 for the lower."""
+    """Build a gum [V, 3] along the whole arch, with tapered ends; `up` is 1 for the upper row, or -1."""
     curve, length = _arch()
     along = np.linspace(-1, 1, _GUM_RINGS)
     at, slope = curve(np.abs(along) * length * 0.96), curve(np.abs(along) * length * 0.96, 1)
@@ -160,7 +160,7 @@ def _ridge(up: float) -> np.ndarray:
 
 
 def _row(sizes_mm: list[list[float]], up: float) -> np.ndarray:
-    """Teeth [V, 3] of a row with the edge of its incisors at the origin; `up`: 1 if roots point up, or -1."""
+    """Build a row of teeth [V, 3], its incisors' edge at the origin; `up` is 1 if roots point up, or -1."""
     curve, _ = _arch()
     widths = [width for width, _ in sizes_mm]
     centres = np.cumsum(widths) - np.array(widths) / 2
@@ -182,7 +182,7 @@ def _row(sizes_mm: list[list[float]], up: float) -> np.ndarray:
 
 
 def _tooth(width: float, height: float, depth: float) -> np.ndarray:
-    """A rounded block [V, 3] with its front at z = 0 and its edge at y = 0."""
+    """Build a rounded block [V, 3] with its front at z = 0 and its edge at y = 0."""
     level = np.linspace(0, 1, _TOOTH_RINGS)
     around = np.arange(_TOOTH_SEGMENTS) / _TOOTH_SEGMENTS * 2 * np.pi
     cos, sin = np.cos(around), np.sin(around)

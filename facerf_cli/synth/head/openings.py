@@ -1,8 +1,8 @@
-"""The mesh of the skin in (u, level), with the eyes and the mouth cut out.
+"""Mesh of the skin in (u, level), with the eyes and the mouth cut out.
 
 (u, level) are the coordinates of `cranium.py`. Samples near an outline move onto it before the cut, so that
 the rim is a smooth curve and not a staircase. Nothing here depends on the person, because the landmarks of
-the UV map, which are the same for everybody, give the openings.
+the UV map, which are the same for all heads, define the openings.
 """
 
 from dataclasses import dataclass
@@ -77,7 +77,7 @@ def outline(name: str) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Lip:
-    """One side of an opening, a lid or a lip, extrapolated into the opening.
+    """Side of an opening, a lid or a lip, extrapolated into the opening.
 
     The face's vertices `replaced` [M] are weighted sums, with `weights` [M, N], of the vertices `sources` [N]
     on this side.
@@ -100,7 +100,7 @@ class Lip:
 
 @cache  # slow, and all heads share it
 def lips(name: str) -> tuple[Lip, Lip]:
-    """The upper and the lower side of an opening, each extrapolated into it.
+    """Return the upper and the lower side of an opening, each extrapolated into it.
 
     The canonical mesh drops from the lid to the eyeball, and from lip to lip, within a cell or two. A finely
     sampled rim would show that drop.
@@ -123,7 +123,7 @@ def lips(name: str) -> tuple[Lip, Lip]:
 
 
 def _thin_plate(known: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Weights [M, N] that extrapolate values at `known` [N, 2] to `wanted` [M, 2] by a thin-plate spline."""
+    """Return the weights [M, N] of a thin-plate spline that extrapolates values at `known` to `wanted`."""
 
     def rows(points: np.ndarray) -> np.ndarray:
         squared = cdist(points, known, "sqeuclidean")
@@ -148,7 +148,7 @@ def _above(points: np.ndarray, line: np.ndarray) -> np.ndarray:
 
 
 def _smooth(points: np.ndarray, steps: int = 12) -> np.ndarray:
-    """A spline through points [K, 2], sampled `steps` times between neighbours."""
+    """Return a spline through points [K, 2], sampled `steps` times between neighbours."""
     length = arc_lengths(points)
     knots = np.arange(len(points))
     at = np.interp(np.linspace(0, knots[-1], knots[-1] * steps + 1), knots, length)
@@ -156,7 +156,7 @@ def _smooth(points: np.ndarray, steps: int = 12) -> np.ndarray:
 
 
 def _graded(start: float, total: float, step: float, coarsest: float) -> np.ndarray:
-    """Positions from `start` (left out) to `start + total`, in steps that grow from `step` to `coarsest`."""
+    """Return positions after `start` up to `start + total`, in steps that grow from `step` to `coarsest`."""
     steps = [step]
     while sum(steps) < total:
         steps.append(min(steps[-1] * _GROWTH, coarsest))
@@ -180,7 +180,7 @@ def _levels(rows: int) -> np.ndarray:
 
 
 def _triangles(rows: int, columns: int) -> np.ndarray:
-    """Triangles [F, 3], counter-clockwise from outside: a grid mirrored at the midline, a fan at the pole."""
+    """Build triangles [F, 3], counter-clockwise from outside: a grid mirrored at the midline, a polar fan."""
     row, col = np.meshgrid(np.arange(rows - 1), np.arange(columns - 1), indexing="ij")
     tl = (row * columns + col).ravel()
     tr, bl, br = tl + 1, tl + columns, tl + columns + 1
@@ -241,7 +241,7 @@ def _edges(faces: np.ndarray) -> np.ndarray:
 
 
 def _signed(points: np.ndarray, polygon: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance [N] to the outline, positive inside, and its nearest points [N, 2]."""
+    """Return the distance [N] to the outline, positive inside, and its nearest points [N, 2]."""
     start, along = polygon, np.roll(polygon, -1, 0) - polygon
     offset = points[:, None] - start
     fraction = np.clip((offset * along).sum(-1) / (along**2).sum(-1), 0, 1)
@@ -273,7 +273,7 @@ def _relaxed(points: np.ndarray, faces: np.ndarray, side: np.ndarray, polygon: n
 
 
 def _rim(inner: np.ndarray) -> np.ndarray:
-    """The border of the removed triangles, in order, counter-clockwise from outside."""
+    """Return the border of the removed triangles, in order, counter-clockwise from outside."""
     pairs = {(int(a), int(b)) for a, b in _edges(inner)}
     onward = {a: b for a, b in pairs if (b, a) not in pairs}
     start = min(onward)

@@ -1,4 +1,4 @@
-"""A whole bare head around the face of any face model: shell, ears, eyeballs, mouth and teeth.
+"""Whole bare head around the face of any face model: shell, ears, eyeballs, mouth and teeth.
 
 The surface of the face is sampled finely and continued over skull, sides and neck (`cranium.py`). Where eyes
 and mouth are open, they are cut out between the lids and between the lips (`openings.py`) and filled. The ear
@@ -39,6 +39,21 @@ _USUAL_MM = np.array([0.0, 1.0, -9.0])  # usual centre from the middle between t
 _ITERATIONS = 8
 _RINGS_DEG = np.array([0, 2, *range(4, 92, 3), 96, 103, 112, 125, 140, 160, 180.0])  # from the gaze axis
 _SEGMENTS = 64  # of a ring
+_CENTRE_MM = np.array([6.0, 2.0])  # rings of vertices shrink from the outline to this point
+_RINGS, _SPOKES = 34, 112
+_OUT_DEG, _BACK_TILT_DEG, _IN_DEG = 27.0, 10.0, 4.0  # orientation of the ear's plane against the head
+_THICKNESS_MM = 3.2
+_SINK_MM = 6.0  # depth of the front rim inside the cheek, so that no gap shows
+_HOLLOW_MM, _HOLLOW_HALF_MM = np.array([7.0, 1.0]), np.array([9.0, 11.0])  # centre and half size
+_BEND_MM = 3.0  # bend of the upper and lower end toward the head
+_ROOT_MM = 20.0  # depth of the ear's back inside the head
+_LIDS = {"eye_left": ((37, 41), (38, 40)), "eye_right": ((43, 47), (44, 46))}  # upper and lower landmarks
+_LIPS = ((61, 67), (62, 66), (63, 65))
+_SHUT_LIDS_MM, _SHUT_LIPS_MM = 2.0, 3.2  # gaps between landmarks up to which an opening is not cut
+_OVERSHUT_LIDS_MM = 0.5  # lids that overlap more than this are cut apart, because the skin would fold
+_AROUND_EYE_MM, _AROUND_EAR_MM = 9.0, 40.0  # reach of the skin that counts as near an eye, near an ear
+_EAR_AZIMUTH_DEG, _EAR_Y_MM = 79.0, 8.0  # place of the ear canal
+_EAR_OUT_MM = 1.5  # of the ear canal from the skin
 
 
 def fitted_centre(margin: np.ndarray, skin: np.ndarray) -> np.ndarray:
@@ -68,7 +83,7 @@ def fitted_centre(margin: np.ndarray, skin: np.ndarray) -> np.ndarray:
 
 
 def eyeball(centre: np.ndarray, gaze_deg: tuple[float, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices [V, 3], triangles [F, 3] and uv [V, 2] of an eyeball that looks along the gaze."""
+    """Return vertices [V, 3], triangles [F, 3] and uv [V, 2] of an eyeball that looks along the gaze."""
     angle, turn = np.meshgrid(
         np.radians(_RINGS_DEG), np.arange(_SEGMENTS) / _SEGMENTS * 2 * np.pi, indexing="ij"
     )
@@ -88,16 +103,6 @@ def eyeball(centre: np.ndarray, gaze_deg: tuple[float, float]) -> tuple[np.ndarr
     reach = np.minimum(angle / (np.pi / 2), 1)
     uv = 0.5 + 0.5 * np.stack([reach * np.cos(turn), -reach * np.sin(turn)], -1).reshape(-1, 2)
     return vertices, capped(len(_RINGS_DEG), _SEGMENTS), uv
-
-
-_CENTRE_MM = np.array([6.0, 2.0])  # rings of vertices shrink from the outline to this point
-_RINGS, _SPOKES = 34, 112
-_OUT_DEG, _BACK_TILT_DEG, _IN_DEG = 27.0, 10.0, 4.0  # orientation of the ear's plane against the head
-_THICKNESS_MM = 3.2
-_SINK_MM = 6.0  # depth of the front rim inside the cheek, so that no gap shows
-_HOLLOW_MM, _HOLLOW_HALF_MM = np.array([7.0, 1.0]), np.array([9.0, 11.0])  # centre and half size
-_BEND_MM = 3.0  # bend of the upper and lower end toward the head
-_ROOT_MM = 20.0  # depth of the ear's back inside the head
 
 
 def ear_surface() -> tuple[np.ndarray, np.ndarray]:
@@ -122,7 +127,7 @@ def ear_surface() -> tuple[np.ndarray, np.ndarray]:
 
 
 def ear_hollow_mm(points: np.ndarray) -> np.ndarray:
-    """Depth [N] by which the skin of the head is pushed in at points [N, 3], to make room for the ear's bowl.
+    """Return how deep [N] to push in the head's skin at points [N, 3], to make room for the ear's bowl.
 
     Points are in the coordinates of `ear_surface`.
     """
@@ -132,7 +137,7 @@ def ear_hollow_mm(points: np.ndarray) -> np.ndarray:
 
 
 def _outline(turn: np.ndarray) -> np.ndarray:
-    """Points [S, 2] of the outline at fractions [S] of its length."""
+    """Return points [S, 2] of the outline at fractions [S] of its length."""
     points = np.array(tables_of(__file__)["ear_mm"], float)
     points = np.concatenate([points, points[:1]])
     length = arc_lengths(points)
@@ -140,7 +145,7 @@ def _outline(turn: np.ndarray) -> np.ndarray:
 
 
 def _relief(rho: np.ndarray, plane: np.ndarray) -> np.ndarray:
-    """Height [R, S] of the ear's outer side above its plane: a sum of bumps and dents."""
+    """Return the height [R, S] of the ear's outer side above its plane: a sum of bumps and dents."""
     a, b = plane[..., 0], plane[..., 1]
     lobe = smoothstep(-b, 10, 20)
     rear = smoothstep(a, -3, 6)
@@ -160,7 +165,7 @@ def _relief(rho: np.ndarray, plane: np.ndarray) -> np.ndarray:
 
 
 def _placed(plane: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """Points [R, S, 3] at (a, b) [R, S, 2] and a height above the plane, which turns out and tilts back."""
+    """Return points [R, S, 3] at (a, b) [R, S, 2] above the plane, which turns out and tilts back."""
     out, tilt = np.radians(_OUT_DEG), np.radians(_BACK_TILT_DEG)
     back = np.array([np.sin(out), 0, -np.cos(out)])
     normal = np.array([np.cos(out), 0, np.sin(out)])
@@ -170,15 +175,6 @@ def _placed(plane: np.ndarray, height: np.ndarray) -> np.ndarray:
     up = up * np.cos(lean) + normal * np.sin(lean)
     normal = np.cross(up, back) * -1
     return plane[..., :1] * back + plane[..., 1:] * up + height[..., None] * normal
-
-
-_LIDS = {"eye_left": ((37, 41), (38, 40)), "eye_right": ((43, 47), (44, 46))}  # upper and lower landmarks
-_LIPS = ((61, 67), (62, 66), (63, 65))
-_SHUT_LIDS_MM, _SHUT_LIPS_MM = 2.0, 3.2  # gaps between landmarks up to which an opening is not cut
-_OVERSHUT_LIDS_MM = 0.5  # lids that overlap more than this are cut apart, because the skin would fold
-_AROUND_EYE_MM, _AROUND_EAR_MM = 9.0, 40.0  # reach of the skin that counts as near an eye, near an ear
-_EAR_AZIMUTH_DEG, _EAR_Y_MM = 79.0, 8.0  # place of the ear canal
-_EAR_OUT_MM = 1.5  # of the ear canal from the skin
 
 
 def shell_head(vertices: Tensor, gaze_deg: tuple[float, float], subdivisions: int) -> HeadMesh:
@@ -215,7 +211,7 @@ def shell_head(vertices: Tensor, gaze_deg: tuple[float, float], subdivisions: in
 
 
 def _rimmed(skin_mm: np.ndarray, sheet: Sheet, rims: dict[str, list[np.ndarray]]) -> HeadMesh:
-    """The skin with rings [N, 3] added at the rims of its openings; a ring has the uv of its rim."""
+    """Return the skin with rings [N, 3] added at the rims of its openings; a ring has the uv of its rim."""
     vertices, uv, triangles = [skin_mm], [_continued_uv(sheet.u_level)], [sheet.triangles]
     for name, rings in rims.items():
         triangles.append(_strip(sheet.rims[name], sum(map(len, vertices)), len(rings)))
@@ -229,18 +225,18 @@ def _rimmed(skin_mm: np.ndarray, sheet: Sheet, rims: dict[str, list[np.ndarray]]
 
 
 def _open(landmarks_mm: np.ndarray) -> tuple[str, ...]:
-    """Names of the openings that are wide enough to be cut."""
+    """Return the names of the openings that are wide enough to be cut."""
     gaps = {
         name: max(landmarks_mm[upper, 1] - landmarks_mm[lower, 1] for upper, lower in pairs)
         for name, pairs in _LIDS.items()
     }
-    found = [name for name, gap in gaps.items() if not -_OVERSHUT_LIDS_MM < gap <= _SHUT_LIDS_MM]
+    shut = [name for name, gap in gaps.items() if not -_OVERSHUT_LIDS_MM < gap <= _SHUT_LIDS_MM]
     parted = max(landmarks_mm[upper, 1] - landmarks_mm[lower, 1] for upper, lower in _LIPS)
-    return (*found, "mouth") if parted > _SHUT_LIPS_MM else tuple(found)
+    return (*shut, "mouth") if parted > _SHUT_LIPS_MM else tuple(shut)
 
 
 def _skin(face_mm: np.ndarray, sheet: Sheet, subdivisions: int, cut: tuple[str, ...]) -> np.ndarray:
-    """Positions [N, 3] in millimetres of the samples of the sheet."""
+    """Return positions [N, 3] in millimetres of the samples of the sheet."""
     on = _on_face(sheet.u_level)
     skin = np.empty((len(on), 3))
     skin[on] = face_surface(face_mm, sheet.u_level[on])
@@ -256,7 +252,7 @@ def _skin(face_mm: np.ndarray, sheet: Sheet, subdivisions: int, cut: tuple[str, 
 
 @cache  # all heads share it
 def _surroundings(subdivisions: int) -> Surroundings:
-    """The head outside the face, at the samples of the sheet."""
+    """Return the head outside the face, at the samples of the sheet."""
     u_level = skin_sheet(subdivisions, ()).u_level
     return Surroundings(u_level[~_on_face(u_level)])
 
@@ -268,7 +264,7 @@ def _on_face(u_level: np.ndarray) -> np.ndarray:
 
 
 def _around_eye(uv: np.ndarray, name: str) -> np.ndarray:
-    """Ids [M] of samples at uv [N, 2] around an eye."""
+    """Return ids [M] of samples at uv [N, 2] around an eye."""
     line, margin = outline(name), _AROUND_EYE_MM / 1000 / (TOP_M - BOTTOM_M)
     return np.flatnonzero(((uv > line.min(0) - margin) & (uv < line.max(0) + margin)).all(-1))
 
@@ -293,7 +289,7 @@ def _inward(edge: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 
 def _lid(edge: np.ndarray, inward: np.ndarray, ball: np.ndarray, down: np.ndarray) -> list[np.ndarray]:
-    """Rings of the margin of the lids, from their edge to just under the surface of the eyeball."""
+    """Build rings of the margin of the lids, from their edge to just under the surface of the eyeball."""
     low = edge + 0.6 * inward
     to_ball = low - ball
     foot = ball + unit(to_ball) * (EYEBALL_RADIUS_MM - 0.3)
@@ -302,7 +298,7 @@ def _lid(edge: np.ndarray, inward: np.ndarray, ball: np.ndarray, down: np.ndarra
 
 
 def _lips(edge: np.ndarray, inward: np.ndarray, down: np.ndarray) -> list[np.ndarray]:
-    """Rings of the lips, which roll back into the mouth."""
+    """Build rings of the lips, which roll back into the mouth."""
     back = np.array([0.0, 0, -1])
     return [
         edge + 0.25 * inward + 0.35 * down + 0.2 * back,
@@ -312,7 +308,7 @@ def _lips(edge: np.ndarray, inward: np.ndarray, down: np.ndarray) -> list[np.nda
 
 
 def _strip(rim: np.ndarray, first: int, rings: int) -> np.ndarray:
-    """Triangles between the vertices of a rim and rings of new vertices with ids from `first`."""
+    """Build triangles between the vertices of a rim and rings of new vertices with ids from `first`."""
     count = len(rim)
     ids = np.concatenate([rim[None], first + np.arange(rings * count).reshape(rings, count)])
     a, b = ids[:-1], np.roll(ids[:-1], -1, 1)
@@ -321,7 +317,7 @@ def _strip(rim: np.ndarray, first: int, rings: int) -> np.ndarray:
 
 
 def _ear_root(skin_mm: np.ndarray, sheet: Sheet, side: float) -> np.ndarray:
-    """Place [3] of the ear canal on one side of the head (1: right in the image, -1: left)."""
+    """Return the position [3] of the ear canal on one side of the head (1: right in the image, -1: left)."""
     u = 0.5 + side * _EAR_AZIMUTH_DEG / (2 * HALF_ANGLE_DEG)
     v = (TOP_M - _EAR_Y_MM / 1000) / (TOP_M - BOTTOM_M)
     nearest = (((sheet.u_level - [u, v]) * UV_SIZE_MM) ** 2).sum(-1).argmin()
@@ -329,7 +325,7 @@ def _ear_root(skin_mm: np.ndarray, sheet: Sheet, side: float) -> np.ndarray:
 
 
 def _hollowed(skin_mm: np.ndarray, root: np.ndarray, side: float) -> np.ndarray:
-    """The skin pushed in behind the bowl of the ear."""
+    """Return the skin pushed in behind the bowl of the ear."""
     near = np.flatnonzero((np.abs(skin_mm - root) < _AROUND_EAR_MM).all(-1))
     hollowed = skin_mm.copy()
     hollowed[near, 0] -= side * ear_hollow_mm((skin_mm[near] - root) * [side, 1, 1])
@@ -337,7 +333,6 @@ def _hollowed(skin_mm: np.ndarray, root: np.ndarray, side: float) -> np.ndarray:
 
 
 def _ear(root: np.ndarray, side: float) -> HeadMesh:
-    """The ear at its place, as part of the skin."""
     vertices, triangles = ear_surface()
     points = root + vertices * [side, 1, 1]
     azimuth_deg = np.degrees(np.arctan2(points[:, 0], points[:, 2]))
@@ -357,7 +352,7 @@ def _part(
 ) -> HeadMesh:
     """Make a mesh of one part, without unused vertices.
 
-    same [V]: the vertex that represents each place; label [V]: classes, by default that of the part.
+    same [V]: the vertex that represents each position; label [V]: classes, by default the part's.
     """
     used = np.zeros(len(vertices_mm), bool)
     used[triangles] = True

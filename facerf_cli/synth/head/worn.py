@@ -1,4 +1,4 @@
-"""Headwear, neckwear and earrings, and a hand or a microphone held before the face.
+"""Headwear, neckwear and earrings, and a hand or a microphone held in front of the face.
 
 Headwear encloses the skull at a distance off the hull of the bare head, down to an edge whose height depends
 on the azimuth. Hair under it lies flat, and hair that would pierce it is left out.
@@ -33,6 +33,16 @@ NECKWEAR = ("turtleneck", "scarf")
 _NECK_AROUND = 144  # vertices around the neck
 _NECK_ROWS = 26  # rings of a surface
 _FLARE_M = 0.03  # below the chin the neck is at its narrowest
+HEADWEAR = ("fedora", "cap", "beanie", "headscarf")
+_AROUND, _ROWS = 144, 40  # vertices around and rings of a shell
+_HAIR_M = 0.004  # thickness of the hair below headwear
+_SMOOTHING = np.hanning(15)  # of a shell's edge
+_FACE_DEG, _FACE_LOW_M = 56.0, -0.074  # a headscarf leaves the face free up to here, and above the chin
+_TUBE_AROUND = 24  # vertices around arms, microphones and rings
+_HAND_DIRECTION = unit(np.array([0.72, -0.66, 0.2]))  # of the packed hand's fingers
+_WRIST_M = 0.035  # half width of the wrist
+_ARM_M = 0.3  # length of the forearm
+_SKIN_UV = (0.5, 1.2)  # a plain place of the skin's texture
 
 
 def draw_neckwear(head: HeadMesh, chin_m: float, random: Random) -> HeadMesh:
@@ -49,7 +59,7 @@ def draw_wraps(head: HeadMesh, chin_m: float, count: int, random: Random) -> Hea
 
 
 def _turtleneck(hull: Hull, chin_m: float, random: Random) -> HeadMesh:
-    """A band that stands around the neck and is folded over at its upper edge."""
+    """Build a band that stands around the neck and is folded over at its upper edge."""
     azimuth = np.linspace(0, 2 * np.pi, _NECK_AROUND, endpoint=False)
     slope = 0.012 * ((1 - np.cos(azimuth)) / 2) ** 0.8  # lower at the front than at the back
     top = chin_m - random.uniform(0.014, 0.028) + slope
@@ -64,7 +74,7 @@ def _turtleneck(hull: Hull, chin_m: float, random: Random) -> HeadMesh:
 
 
 def _wrap(hull: Hull, chin_m: float, index: int, random: Random) -> HeadMesh:
-    """One turn of a scarf: a soft roll, hanging lower in front, with folds along it."""
+    """Build one turn of a scarf: a soft roll, hanging lower in front, with folds along it."""
     azimuth = np.linspace(0, 2 * np.pi, _NECK_AROUND, endpoint=False)
     around = np.linspace(0, 2 * np.pi, _NECK_ROWS)[:, None]
     high, deep = random.uniform(0.022, 0.032), random.uniform(0.022, 0.034)
@@ -84,7 +94,7 @@ def _loft(hull: Hull, chin_m: float, azimuth: np.ndarray, level: np.ndarray, off
     outward = np.stack([np.sin(azimuth), 0 * azimuth, np.cos(azimuth)], -1)
     far = outward + np.array([0, 0, hull.middle[2]])
     far = np.stack([np.broadcast_to(far[:, 0], off.shape), level, np.broadcast_to(far[:, 2], off.shape)], -1)
-    neck = np.maximum(level, chin_m - _FLARE_M)  # further down the shoulders begin
+    neck = np.maximum(level, chin_m - _FLARE_M)  # the shoulders begin below
     on_neck = np.stack([far[..., 0], neck, far[..., 2]], -1)
     rings = far - ((hull.height(on_neck) - off)[..., None]) * outward
     return ring_surface("cloth", rings if _faces_out(rings, outward) else rings[::-1])
@@ -98,19 +108,9 @@ def _faces_out(rings: np.ndarray, outward: np.ndarray) -> bool:
     return bool(inner[0] > inner[-1])
 
 
-HEADWEAR = ("fedora", "cap", "beanie", "headscarf")
-
-_AROUND, _ROWS = 144, 40  # vertices around and rings of a shell
-_HAIR_M = 0.004  # thickness of the hair below headwear
-_FACE_DEG, _FACE_LOW_M = (
-    56.0,
-    -0.074,
-)  # a headscarf leaves the face free, within this azimuth and above the chin
-
-
 @dataclass(frozen=True, eq=False)
 class Headwear:
-    """A piece on a head: its mesh, and the shell that hair must not leave above the edge."""
+    """Piece on a head: its mesh, and the shell that hair must not leave above the edge."""
 
     kind: str
     mesh: HeadMesh
@@ -119,7 +119,6 @@ class Headwear:
     edge_m: tuple[float, float, float]  # height of the edge at the front, the side and the back
 
     def flat(self, style: HairStyle) -> HairStyle:
-        """The style as it lies under this piece."""
         comb = "whorl" if style.comb == "out" else style.comb
         thin = min(style.layer_mm, 1000 * _HAIR_M)
         return replace(
@@ -127,7 +126,7 @@ class Headwear:
         )
 
     def uncovered(self, hair: HeadMesh) -> HeadMesh:
-        """The hair without triangles that would pierce the shell; under a headscarf none is left."""
+        """Return the hair without triangles that would pierce the shell; under a headscarf none is left."""
         above = hair.vertices[:, 1] > _edge(self.edge_m, np.arctan2(hair.vertices[:, 0], hair.vertices[:, 2]))
         pierced = above & (self.hull.height(hair.vertices.astype(float)) > self.off_m - 0.0015)
         hidden = np.ones(len(pierced), bool) if self.kind == "headscarf" else pierced
@@ -157,7 +156,7 @@ def _edge(edge_m: tuple[float, float, float], azimuth: np.ndarray) -> np.ndarray
 
 
 def _on_hull(hull: Hull, azimuth: np.ndarray, arc_m: np.ndarray, off_m: np.ndarray) -> np.ndarray:
-    """Points [..., 3] off the hull at azimuths and arcs above its middle (below it: heights)."""
+    """Return points [..., 3] off the hull at azimuths and arcs above its middle (below it: heights)."""
     elevation = np.maximum(arc_m, 0) / HULL_RADIUS_M
     level = np.minimum(arc_m, 0)
     outward = np.stack(
@@ -168,7 +167,7 @@ def _on_hull(hull: Hull, azimuth: np.ndarray, arc_m: np.ndarray, off_m: np.ndarr
 
 
 def _arc_of(hull: Hull, height_m: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
-    """The arcs [N] at which the hull has these heights [N] at azimuths [N]."""
+    """Return the arcs [N] of the hull that have these heights [N] at azimuths [N]."""
     arcs = np.linspace(-0.1, 0.13, 47)
     heights = _on_hull(hull, azimuth[:, None], np.broadcast_to(arcs, (len(azimuth), 47)), np.zeros(47))[
         ..., 1
@@ -179,9 +178,10 @@ def _arc_of(hull: Hull, height_m: np.ndarray, azimuth: np.ndarray) -> np.ndarray
 def _shell(
     hull: Hull, edge_m: tuple[float, float, float], off_m: float, peak_m: float, ribbed: bool
 ) -> HeadMesh:
-    """A cap over the skull from its edge to the crown, with a rolled band if it is knitted."""
+    """Build a cap over the skull from its edge to the crown, with a rolled band if it is knitted."""
     azimuth = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False)
-    low = _smooth_around(_arc_of(hull, _edge(edge_m, azimuth), azimuth))
+    low = _arc_of(hull, _edge(edge_m, azimuth), azimuth)
+    low = np.convolve(np.concatenate([low[-7:], low, low[:7]]), _SMOOTHING / _SMOOTHING.sum(), "valid")
     share = np.linspace(0, 1, _ROWS)[:, None]
     arc = low + (0.141 - low) * share
     off = off_m + 0.002 + peak_m * smoothstep(share, 0.3, 1.0) * (1 + 0.4 * np.cos(azimuth))
@@ -195,14 +195,8 @@ def _shell(
     return ring_surface("hat", rings[::-1])
 
 
-def _smooth_around(values: np.ndarray) -> np.ndarray:
-    """Values [N] around the head without steps."""
-    kernel = np.hanning(15) / np.hanning(15).sum()
-    return np.convolve(np.concatenate([values[-7:], values, values[:7]]), kernel, "valid")
-
-
 def _visor(hull: Hull, edge_m: tuple[float, float, float], off_m: float, random: Random) -> HeadMesh:
-    """The visor of a cap: a curved plate in front of the edge."""
+    """Build the visor of a cap: a curved plate in front of the edge."""
     reach, drop = random.uniform(0.055, 0.075), random.uniform(0.008, 0.025)
     azimuth = np.linspace(-1.15, 1.15, 60)
     arc = _arc_of(hull, _edge(edge_m, azimuth), azimuth)
@@ -217,7 +211,7 @@ def _visor(hull: Hull, edge_m: tuple[float, float, float], off_m: float, random:
 
 
 def _fedora(hull: Hull, edge_m: tuple[float, float, float], off_m: float) -> HeadMesh:
-    """MakeHuman's hat, stretched to the hull at its edge."""
+    """Build MakeHuman's hat, stretched to the hull at its edge."""
     vertices, faces = packed_mesh("fedora")
     step, faces = loop_step(faces, len(vertices))
     vertices = step @ vertices
@@ -236,7 +230,7 @@ def _fedora(hull: Hull, edge_m: tuple[float, float, float], off_m: float) -> Hea
 
 
 def _headscarf(head: HeadMesh, hull: Hull, chin_m: float, off_m: float, random: Random) -> HeadMesh:
-    """Cloth around skull, cheeks and neck that leaves the face free, wrapped below the chin."""
+    """Build a cloth around skull, cheeks and neck that leaves the face free, wrapped below the chin."""
     azimuth = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False)
     signed = (azimuth + np.pi) % (2 * np.pi) - np.pi
     open_rad = np.radians(_FACE_DEG)
@@ -254,21 +248,9 @@ def _headscarf(head: HeadMesh, hull: Hull, chin_m: float, off_m: float, random: 
     under = np.where(faced, bottom - hull.middle[1], 0.0)
     arc_low = under + (low - under) * share
     shells.append(ring_surface("hat", _on_hull(hull, azimuth, arc_low, off_m + fold + 0.012 * share)))
-    wraps = draw_wraps(head, chin_m - 0.012, 2, random)
-    return _as_hat(joined(*shells, wraps))
-
-
-def _as_hat(mesh: HeadMesh) -> HeadMesh:
-    """The same mesh as part "hat"."""
+    mesh = joined(*shells, draw_wraps(head, chin_m - 0.012, 2, random))
     like = strandless("hat", mesh.vertices, mesh.normals, mesh.triangles, mesh.uv)
     return replace(mesh, part=like.part, label=like.label)
-
-
-_TUBE_AROUND = 24  # vertices around arms, microphones and rings
-_HAND_DIRECTION = unit(np.array([0.72, -0.66, 0.2]))  # of the packed hand's fingers
-_WRIST_M = 0.035  # half width of the wrist
-_ARM_M = 0.3  # length of the forearm
-_SKIN_UV = (0.5, 1.2)  # a plain place of the skin's texture
 
 
 def draw_hand(head: HeadMesh, random: Random) -> HeadMesh:
@@ -336,7 +318,7 @@ def draw_earrings(lobes: list[np.ndarray], random: Random) -> HeadMesh:
 
 
 def _hoop(centre: np.ndarray, radius: float) -> HeadMesh:
-    """A thin ring in the plane across the head."""
+    """Build a thin ring in the plane across the head."""
     turn = np.linspace(0, 2 * np.pi, 33)[:, None]
     away = np.concatenate([0 * turn, np.cos(turn), np.sin(turn)], 1)
     around = np.linspace(0, 2 * np.pi, 8, endpoint=False)
@@ -350,7 +332,7 @@ def _hoop(centre: np.ndarray, radius: float) -> HeadMesh:
 
 
 def _tube(part: str, start: np.ndarray, end: np.ndarray, wide_m: float, wider_m: float) -> HeadMesh:
-    """An open tube between two points that widens."""
+    """Build an open tube between two points that widens."""
     share = np.linspace(0, 1, 24)[:, None]
     return ring_surface(
         part, _rings(start + share * (end - start), unit(end - start), wide_m + share * (wider_m - wide_m))
@@ -358,7 +340,7 @@ def _tube(part: str, start: np.ndarray, end: np.ndarray, wide_m: float, wider_m:
 
 
 def _rings(centres: np.ndarray, along: np.ndarray, radii: np.ndarray) -> np.ndarray:
-    """Rings [R, N, 3] of radii [R, 1] about centres [R, 3], across a direction that leads down."""
+    """Return rings [R, N, 3] of radii [R, 1] about centres [R, 3], across a direction that leads down."""
     across = unit(np.cross(along, [0.0, 0, 1]))
     ahead = np.cross(across, along)
     turn = np.linspace(0, 2 * np.pi, _TUBE_AROUND, endpoint=False)

@@ -1,6 +1,6 @@
 """Kinds of procedural envmaps indoors: windows, hall, studio, stage; and the furnished room they show.
 
-A room is a box. Its lights illuminate it by distance and angle; interreflection adds an even light.
+A room is a box. Its lights illuminate it by distance and angle; interreflection adds a uniform light.
 
 The sky outside a window has a radiance of about 1 before exposure; `skies.py` normalises the finished map.
 """
@@ -29,11 +29,12 @@ _CLOSEST_M = 0.5  # least distance to a light: lights have an extent, so 1 / r^2
 _FLOORS = np.array(
     [[0.35, 0.2, 0.1], [0.5, 0.34, 0.2], [0.16, 0.09, 0.05], [0.25, 0.25, 0.26], [0.5, 0.48, 0.45]]
 )
+_MAX_HALL_LIGHTS = 12  # ceiling lights that illuminate the room; the image shows all
 
 
 @dataclass(frozen=True)
 class Box:
-    """A room around the head, in metres, rotated about the vertical."""
+    """Room around the head, in metres, rotated about the vertical."""
 
     low: np.ndarray  # [3] lower back corner
     high: np.ndarray  # [3] opposite corner
@@ -65,7 +66,7 @@ class RoomLights:
 
 @dataclass(frozen=True)
 class Room:
-    """A box, and the surface that each pixel of the map shows."""
+    """Box, and the surface that each pixel of the map shows."""
 
     box: Box
     points: np.ndarray  # [H, W, 3] m, in the box's axes
@@ -84,7 +85,7 @@ class Room:
         return np.asarray(self.albedo / np.pi * (direct + even * self.crease[..., None]))
 
     def _irradiance(self, centre: np.ndarray, flat: bool) -> np.ndarray:
-        """Irradiance [H, W] from a light whose radiance times solid angle, seen from the head, is 1."""
+        """Return the irradiance [H, W] from a light whose radiance times solid angle, at the head, is 1."""
         ahead = (self.box.turn @ centre).astype(np.float32)
         distance_m = float(self.box.hits(np.zeros(3, np.float32), ahead)[0]) * 0.93
         away = self.points - distance_m * ahead
@@ -119,7 +120,7 @@ def draw_room(grid: Grid, random: Random, wall: tuple[float, float], largest_m: 
 def _surfaces(
     grid: Grid, random: Random, points: np.ndarray, normals: np.ndarray, wall: tuple[float, float], eye: float
 ) -> np.ndarray:
-    """Albedo [H, W, 3] of walls (one may be coloured), a bright ceiling, a floor and furniture."""
+    """Return the albedo [H, W, 3] of walls (one may be coloured), a bright ceiling, a floor and furniture."""
     grey = float(np.exp(random.uniform(*np.log(wall))))
     walls = grey * np.array([1.0, 0.96, 0.9]) ** random.uniform(0, 2)
     accent = np.clip(walls * np.exp(random.normal(0, 0.45, 3)), 0, 0.85) if random.random() < 0.4 else walls
@@ -156,9 +157,6 @@ def _furnish(
     return np.asarray(albedo + share[..., None] * (shaded - albedo))
 
 
-_MAX_HALL_LIGHTS = 12  # ceiling lights that illuminate the room; the image shows all
-
-
 def windows(grid: Grid, random: Random) -> np.ndarray:
     """Draw a room with one to four windows on sky and land; some have direct sun or a ceiling light."""
     room, lights = draw_room(grid, random, (0.35, 0.75)), RoomLights(grid)
@@ -181,7 +179,8 @@ def windows(grid: Grid, random: Random) -> np.ndarray:
         lights.add(
             centre, paint(bulb, draw_white(random, 0.6, 1) * np.exp(random.uniform(2.5, 5.5))), flat=False
         )
-    return lights.image + room.lit(lights) * _opaque(grid, panes)
+    opaque = np.prod([1 - _pane(grid, pane) for pane in panes], axis=0)
+    return lights.image + room.lit(lights) * opaque[..., None]
 
 
 def _outside(grid: Grid, random: Random) -> np.ndarray:
@@ -197,7 +196,7 @@ def _outside(grid: Grid, random: Random) -> np.ndarray:
 
 
 def _pane(grid: Grid, pane: Rectangle) -> np.ndarray:
-    """Coverage [H, W] of the glass of a window: the pane without its glazing bars."""
+    """Return the coverage [H, W] of the glass of a window: the pane without its glazing bars."""
     x, y, _ = pane.place(grid.directions)
     upright, across = (0.05 - np.abs(x)) * pane.wide, (0.03 - np.abs(y - 0.35)) * pane.high
     bars = np.maximum(grid.share(upright), grid.share(across))
@@ -205,16 +204,8 @@ def _pane(grid: Grid, pane: Rectangle) -> np.ndarray:
     return np.asarray(pane.cover(grid.directions, grid.pixel_rad) * (1 - thin * bars))
 
 
-def _opaque(grid: Grid, panes: list[Rectangle]) -> np.ndarray:
-    """Share of each pixel [H, W, 1] that shows the room and not the glass of a window."""
-    clear = np.ones(grid.directions.shape[:2])
-    for pane in panes:
-        clear = clear * (1 - _pane(grid, pane))
-    return clear[..., None]
-
-
 def _sunlit(grid: Grid, room: Room, pane: Rectangle, random: Random) -> np.ndarray:
-    """Cosine [H, W] of the sun on the surfaces that it reaches through a window."""
+    """Return the cosine [H, W] of the sun on the surfaces that it reaches through a window."""
     sun = room.box.turn @ toward(pane.azimuth_deg + random.uniform(-35, 35), random.uniform(15, 50))
     sun = sun.astype(np.float32)
     points = room.points * 0.999

@@ -1,4 +1,4 @@
-"""The maps of `facerf envmap`, and their contact sheet: each map beside a white ball under it."""
+"""Maps of `facerf envmap`, and their contact sheet: each map beside a white ball under it."""
 
 import logging
 from collections.abc import Iterable, Sequence
@@ -24,6 +24,9 @@ from facerf_cli.synth.sky.skies import KINDS, MIX, draw_sky, kind_of
 SHEET = "envmaps.png"
 Facts = dict[str, str | int | float]
 log = logging.getLogger(LOGGER_NAME)
+MOST_MAPS = 300  # on a sheet; more would be too many to look at
+_MAP_PX = 96  # height of a map
+_LABEL_PX = 16
 
 
 def write_envmaps(
@@ -36,7 +39,7 @@ def write_envmaps(
     """
     kinds = tuple(dict.fromkeys(kind)) if kind else MIX
     if unknown := [name for name in kinds if name not in KINDS]:
-        raise UsageError(f"--kind {unknown[0]}: no such kind; give one of {', '.join(KINDS)}")
+        raise UsageError(f"--kind {unknown[0]}: no such kind; use one of {', '.join(KINDS)}")
     maps: dict[Path, Facts] = {}
     for index in range(count):
         name = kind_of(index, seed, kinds)
@@ -54,7 +57,7 @@ def write_envmaps(
                 raise InputError(refusal)
     for index, (path, facts) in enumerate(maps.items()):
         if path not in new:
-            log.info("%s: already exists (--overwrite always makes it again)", path)
+            log.info("%s: already exists (--overwrite always redraws it)", path)
             continue
         if not batch.dry_run:
             pixels, _ = draw_sky(index, seed, size_px, kinds)
@@ -73,18 +76,12 @@ def _is_to_be_made(path: Path, facts: Facts, width_px: int, overwrite: Overwrite
     """Tell if a map is missing or damaged, or was drawn from another seed or at another width."""
     if overwrite != "changed":
         return overwrite == "always" or not path.exists()
-    found = read_header(path)
-    return not (found and found.width_px == width_px and facts.items() <= found.metadata.items())
+    header = read_header(path)
+    return not (header and header.width_px == width_px and facts.items() <= header.metadata.items())
 
 
 def _is_older(sheet: Path, maps: Iterable[Path]) -> bool:
-    """Tell if a run was ended between the last map and the sheet."""
     return not sheet.exists() or any(path.stat().st_mtime > sheet.stat().st_mtime for path in maps)
-
-
-MOST_MAPS = 300  # on a sheet; more would be too many to look at
-_MAP_PX = 96  # height of a map
-_LABEL_PX = 16
 
 
 def write_sheet(maps: Sequence[Path], sheet: Path) -> None:
@@ -94,13 +91,13 @@ def write_sheet(maps: Sequence[Path], sheet: Path) -> None:
 
 
 def _tile(path: Path) -> np.ndarray:
-    """A map and its ball side by side, each exposed well, over the name [h, 3 maps' heights, 3], linear."""
+    """Return a map and its ball side by side, each exposed well, above the name; linear, 3 heights wide."""
     envmap = mean_radiance(read_map_file(path), _MAP_PX, 0)
     pixels = torch.nn.functional.interpolate(envmap.permute(2, 0, 1)[None], (_MAP_PX, 2 * _MAP_PX))[0]
     shaded = ball(envmap, _MAP_PX, "diffuse").numpy()
     shown = [_exposed(pixels.permute(1, 2, 0).numpy(), None), _exposed(shaded, shaded.max(-1) > 0)]
-    picture = np.concatenate(shown, 1)
-    return np.concatenate([picture, labels([path.stem], picture.shape[1], _LABEL_PX)])
+    tile = np.concatenate(shown, 1)
+    return np.concatenate([tile, labels([path.stem], tile.shape[1], _LABEL_PX)])
 
 
 def _exposed(linear: np.ndarray, mask: np.ndarray | None) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 Units differ by kind (kcd/m2 by day, relative ones otherwise); `skies.py` normalises the finished map.
 
-Clear sky and sun are those of Preetham, Shirley and Smits, 'A Practical Analytic Model for Daylight' (1999).
+Clear sky and sun follow Preetham, Shirley and Smits, 'A Practical Analytic Model for Daylight' (1999).
 The sky is appendix A.2: Perez's distribution, and the luminance and chromaticity of the zenith. The sun is
 appendix A.1 with the spectra of table 2: the radiance above the atmosphere, reduced by Rayleigh, aerosol and
 ozone extinction. Mixed gases and water vapour are left out, as they absorb only beyond 690 nm.
@@ -37,6 +37,11 @@ _SUN_NM = np.arange(380, 751, 10.0)  # wavelengths of the spectra of sun and ozo
 _SUN = 10 * _TABLES["sun"]
 _OZONE_CM = 0.35  # thickness of the ozone layer (appendix A.1)
 _LUMENS_PER_WATT = 683.0  # at the peak of photopic vision
+EYE_M = 1.6  # height of the head above the ground
+_EARTH_KM = 6371.0  # radius
+_SHARPNESS = 0.78  # g of Henyey and Greenstein's phase function, lowered to stand for multiple scattering
+_LAMP_M = 0.2  # radius of a street light
+_NO_BEAM, _UP = np.zeros(3), np.array([0.0, 1.0, 0.0], np.float32)
 
 
 def preetham_sky(directions: np.ndarray, sun: np.ndarray, turbidity: float) -> np.ndarray:
@@ -91,7 +96,7 @@ def transmittance(wavelength_nm: np.ndarray, elevation_deg: float, turbidity: fl
 
 
 def _sun_to_xyz() -> np.ndarray:
-    """Matrix [3, W] from the spectral radiance of the sun (table 2) to its XYZ irradiance in klx."""
+    """Return the matrix [3, W] from the sun's spectral radiance (table 2) to its XYZ irradiance in klx."""
     per_nm = SUN_SR * 10.0  # from W / (cm2 um sr) over the disc to W / (m2 nm)
     step_nm = _SUN_NM[1] - _SUN_NM[0]
     return np.asarray(_LUMENS_PER_WATT / 1000 * per_nm * step_nm * _colour_matching(_SUN_NM))
@@ -114,12 +119,9 @@ def _lobe(nm: np.ndarray, height: float, middle: float, left: float, right: floa
     return np.asarray(height * np.exp(-0.5 * ((nm - middle) / np.where(nm < middle, left, right)) ** 2))
 
 
-EYE_M = 1.6  # height of the head above the ground
-
-
 @dataclass(frozen=True)
 class Skyline:
-    """A silhouette on the horizon: its upper edge and albedo at every azimuth."""
+    """Silhouette on the horizon: its upper edge and albedo at every azimuth."""
 
     tops_rad: np.ndarray  # [RING]; below 0 where there is nothing
     albedo: np.ndarray  # [RING, 3]
@@ -221,7 +223,7 @@ def add_land(
 
 
 def _ground(grid: Grid, land: Land, level: np.ndarray) -> np.ndarray:
-    """Radiance [H, W, 3] of the ground, black above; `level` [H, W, 3] or [3] is that of a white ground."""
+    """Return the radiance [H, W, 3] of the ground, black above; `level` is the radiance if it were white."""
     half = len(grid.directions) // 2
     down = np.maximum(-grid.directions[half:, :, 1], 1e-3)
     x, z = (grid.directions[half:, :, axis] * (EYE_M / down) for axis in (0, 2))
@@ -268,13 +270,9 @@ def sun_is_visible(land: Land, azimuth_deg: float, elevation_deg: float) -> bool
     return land.top_rad(float(np.radians(azimuth_deg))) < np.radians(elevation_deg)
 
 
-_EARTH_KM = 6371.0  # radius
-_SHARPNESS = 0.78  # g of Henyey and Greenstein's phase function, lowered to stand for multiple scattering
-
-
 @dataclass(frozen=True)
 class Layer:
-    """A sheet of cloud at one height, with optical depth from noise."""
+    """Sheet of cloud at one height, with optical depth from noise."""
 
     tile: np.ndarray  # [256, 256] noise of standard deviation 1
     height_km: float
@@ -349,10 +347,6 @@ def _toward_sun(directions: np.ndarray, sun: np.ndarray, layers: list[Layer]) ->
     return np.asarray(sum(depths))
 
 
-_LAMP_M = 0.2  # radius of a street lamp
-_NO_BEAM, _UP = np.zeros(3), np.array([0.0, 1.0, 0.0], np.float32)
-
-
 def sun(grid: Grid, random: Random) -> np.ndarray:
     """Draw a clear to hazy day: sun at 2 to 75 degrees of elevation, clouds, and land."""
     turbidity = np.exp(random.uniform(np.log(2), np.log(8)))
@@ -403,7 +397,7 @@ def overcast(grid: Grid, random: Random) -> np.ndarray:
 
 
 def night(grid: Grid, random: Random) -> np.ndarray:
-    """Draw a street at night: a row of street lamps, lit windows, paving and houses under a dim sky."""
+    """Draw a street at night: a row of street lights, lit windows, paving and houses under a dim sky."""
     glow = random.uniform(0.005, 0.05)
     sky = paint(glow * (1.5 - np.clip(grid.directions[..., 1], 0, 1)), [0.9, 0.75, 0.8])
     land = draw_land(random, houses=0.9)
@@ -418,13 +412,13 @@ def night(grid: Grid, random: Random) -> np.ndarray:
         beam += radiance * np.pi * (_LAMP_M / distance_m) ** 2
     for _ in range(random.integers(0, 40)):
         lights += _lit_window(grid, random, land)
-    fronts = 0.15 * beam  # light on houses, as if all lamps stood at the viewer
-    lit = paint(pools, lamp_rgb) + 0.03 * beam  # the second term stands for lamps farther on
+    fronts = 0.15 * beam  # light on houses, if all street lights stood at the viewer
+    lit = paint(pools, lamp_rgb) + 0.03 * beam  # the second term stands for lights farther away
     return add_land(grid, sky, land, _UP, _NO_BEAM, fronts, lit) + lights
 
 
 def _street_lamps(random: Random) -> tuple[np.ndarray, np.ndarray]:
-    """Draw positions [L, 3] (m, from the head) of lamps along a road, and their colour [3]."""
+    """Draw positions [L, 3] (m, from the head) of street lights along a road, and their colour [3]."""
     lamp_rgb = np.array([[1.7, 1.0, 0.25], [1.3, 1.0, 0.6], [0.95, 1.0, 1.05]][random.integers(3)])
     lamps, road = random.integers(3, 12), toward(random.uniform(-180, 180), 0).astype(float)
     along_m, aside_m = random.uniform(-40, 40, lamps)[:, None], random.choice([-5, 5], lamps)[:, None]
@@ -433,7 +427,7 @@ def _street_lamps(random: Random) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _pool(grid: Grid, place_m: np.ndarray) -> np.ndarray:
-    """Irradiance [H, W] on the ground from a street lamp of radiance 1."""
+    """Return the irradiance [H, W] on the ground from a street light of radiance 1."""
     down = np.minimum(grid.directions[..., 1:2], -0.003)
     away = place_m - grid.directions * (EYE_M / -down)
     square = (away * away).sum(-1)

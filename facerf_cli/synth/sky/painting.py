@@ -41,7 +41,7 @@ class Grid:
         return np.arcsin(np.clip(self.directions[:, :1, 1], -1, 1))
 
     def share(self, depth_rad: np.ndarray) -> np.ndarray:
-        """Share [...] of a pixel that lies inside an edge, from its centre's depth inside."""
+        """Return the share [...] of a pixel that lies inside an edge, from its centre's depth inside."""
         return np.asarray(np.clip(depth_rad / self.pixel_rad + 0.5, 0, 1))
 
 
@@ -74,7 +74,7 @@ def disc(grid: Grid, centre: np.ndarray, radius_deg: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Rectangle:
-    """A flat rectangle at distance 1 that faces the viewer, of half width `wide` and half height `high`."""
+    """Flat rectangle at distance 1 that faces the viewer, of half width `wide` and half height `high`."""
 
     azimuth_deg: float
     elevation_deg: float

@@ -24,7 +24,7 @@ MIX = (*4 * ("sun",), *2 * ("dusk", "overcast", "windows", "hall", "studio"), "n
 
 
 def kind_of(index: int, seed: int, kinds: Sequence[str] = MIX) -> str:
-    """Draw the kind of map number `index`, a function of (seed, index) alone."""
+    """Draw the kind of map number `index`, a function of only (seed, index)."""
     return kinds[int(np.random.default_rng([seed, index, 0]).integers(len(kinds)))]
 
 
@@ -41,7 +41,7 @@ def draw_sky(index: int, seed: int, width_px: int, kinds: Sequence[str] = MIX) -
 
 @dataclass(frozen=True)
 class ProceduralMaps:
-    """A sequence of `maps` procedural envmaps, each drawn on access."""
+    """Sequence of `maps` procedural envmaps, each drawn on access."""
 
     maps: int
     seed: int

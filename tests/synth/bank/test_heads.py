@@ -40,7 +40,7 @@ def test_finished_heads_are_kept_and_a_lost_one_is_rebuilt_the_same(bank_folder:
 
 def test_heads_of_another_model_and_an_empty_folder_are_errors(bank_folder: Path, tmp_path: Path) -> None:
     save_face_model(tmp_path / "other.npz", replace(load_face_model(), name="other"))
-    with pytest.raises(InputError, match="the head is of face model builtin, not of other"):
+    with pytest.raises(InputError, match=r"builtin.*--bank"):
         bake_heads(bank_folder / "heads", str(tmp_path / "other.npz"), 6, jobs=1, seed=1, settings=TINY)
     refused(InputError, "no baked heads", load_bank, tmp_path, tmp_path, {})
     views = load_file(sorted((bank_folder / "views").iterdir())[1])

@@ -12,6 +12,7 @@ from facerf_cli.face.morphable import load_face_model
 from facerf_cli.portrait.parse import MORE_LANDMARKS, class_index
 from facerf_cli.synth.bank import parsing
 from facerf_cli.synth.bank.parsing import FeatureWarp, PortraitCrops, StoredPortraits
+from facerf_cli.synth.camera import SimulatedCamera
 from tests.kinds import Folders, Patch
 from tests.refusals import refused
 
@@ -33,16 +34,14 @@ def portraits(tmp_path_factory: Folders) -> StoredPortraits:
     for person in range(2):
         label = torch.where(disc, class_index("skin"), class_index("garment")).byte()
         picture = torch.where(disc, 200, 60)[None] * torch.ones(3, 1, 1) * (disc | garment)
-        save_file(
-            {
-                "pictures": picture.byte().expand(2, 3, 3, STORED, STORED).contiguous(),
-                "alpha": (255 * (disc | garment)).byte().expand(2, STORED, STORED).contiguous(),
-                "label": label.expand(2, STORED, STORED).contiguous(),
-                "landmarks_px": ring.expand(2, -1, 2).contiguous(),
-                "rotation": torch.eye(3).expand(2, 3, 3).contiguous(),
-            },
-            folder / f"{person:05}.safetensors",
-        )
+        for camera in range(2):
+            photo = {
+                "images": picture.byte().expand(3, 3, STORED, STORED).contiguous(),
+                "alpha": (255 * (disc | garment)).byte(),
+                "label": label,
+                "landmarks_px": ring,
+            }
+            save_file(photo, folder / f"photo_{person:05}_{camera}.safetensors")
     backgrounds = torch.randint(0, 60, (3, 3, 32, 32), generator=torch.Generator().manual_seed(0)).byte()
     return StoredPortraits(folder, backgrounds, {"licence": "MIT"})
 
@@ -65,7 +64,7 @@ def test_a_draw_is_a_function_of_its_generator_and_an_empty_folder_none(
         one, two = drawn(portraits, seed), drawn(portraits, seed)
         assert all(torch.equal(getattr(one, name), getattr(two, name)) for name in vars(one))
         assert one.crops.min() >= 0 and one.crops.max() <= 1 and one.crops.isfinite().all()
-    refused(InputError, "no portraits", StoredPortraits, tmp_path, torch.zeros(1, 3, 8, 8).byte(), {})
+    refused(InputError, "no photos", StoredPortraits, tmp_path, torch.zeros(1, 3, 8, 8).byte(), {})
 
 
 @pytest.mark.usefixtures("plain")
@@ -136,8 +135,9 @@ def test_decoys_have_the_persons_colours_and_lie_behind(
     portraits: StoredPortraits, monkeypatch: Patch
 ) -> None:
     """Each image over black, with decoys and without: the person stays, and shapes appear around it."""
-    monkeypatch.setattr(StoredPortraits, "_background", lambda self, side, _: torch.zeros(3, side, side))
-    monkeypatch.setattr(parsing, "_as_taken", lambda image, generator: image)
+    monkeypatch.setattr(parsing, "background", lambda stored, side, _: torch.zeros(3, side, side))
+    monkeypatch.setattr(SimulatedCamera, "colours", lambda self, _: torch.eye(3))
+    monkeypatch.setattr(SimulatedCamera, "take", lambda self, image, mean, _: image)
     found = {}
     for share in (0.0, 1.0):
         monkeypatch.setattr(parsing, "_DECOYED", share)

@@ -1,5 +1,6 @@
-"""People of the portrait bank: baked once, seen as users' photos are, and lit by any light."""
+"""People of a bank: baked once, photographed, seen as users' photos are, and lit by any light."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -17,11 +18,13 @@ from facerf_cli.light.sh import sh_basis
 from facerf_cli.light.sphere import direction_to_azel, rig_directions
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.network.portrait import SKIN
+from facerf_cli.portrait.parse import MORE_LANDMARKS, class_index
 from facerf_cli.portrait.person import SIDES
 from facerf_cli.raster.camera import project
 from facerf_cli.relighting.white import BARE, without_colour_of_shade
 from facerf_cli.synth import bank
-from facerf_cli.synth.bank import Files, portrait_samples, transport
+from facerf_cli.synth.bank import Files, people, portrait_samples
+from facerf_cli.synth.bank.people import PeopleBankSettings, add_people, photos_in, read_photo
 from facerf_cli.synth.bank.portrait_samples import (
     PortraitSample,
     StoredTransport,
@@ -29,8 +32,8 @@ from facerf_cli.synth.bank.portrait_samples import (
     draw_targets,
     load_view,
 )
-from facerf_cli.synth.bank.transport import TransportBankSettings, add_transport, seen_path
-from facerf_cli.synth.portraits import albedo_of, images_under
+from facerf_cli.synth.bank.proxies import seen_path
+from facerf_cli.synth.renderer import albedo_of, images_under
 from facerf_cli.synth.subjects import Subject
 from tests.refusals import refused
 from tests.synth.conftest import SMALL, backgrounds
@@ -39,8 +42,8 @@ SIDE_PX = SMALL.side_px
 
 
 @pytest.fixture(scope="module")
-def folder(transport_folder: Path) -> Path:
-    return transport_folder
+def folder(people_folder: Path) -> Path:
+    return people_folder
 
 
 @pytest.fixture(scope="module")
@@ -65,11 +68,11 @@ def test_images_are_linear_in_light_and_looks_differ_in_albedo(view: StoredView)
     (first, normals), (second, again) = (albedo_of(view.portrait, look) for look in view.looks)
     assert (first - second).abs().mean() > 0.01 and torch.equal(normals, again)
     assert first.min() >= 0 and first.max() < 1
-    assert first[:, view.alpha == 0].max() < 0.05  # alpha is in 256 steps
+    assert first[:, view.portrait.alpha == 0].max() < 0.05  # alpha is in 256 steps
     landmarks = view.portrait.landmarks_px[:68]
     extent = float((landmarks.amax(0) - landmarks.amin(0)).max())
     assert extent == pytest.approx(SIDE_PX / SIDES, rel=0.25)  # four deviations
-    assert 0.15 < view.alpha.mean() < 0.9
+    assert 0.15 < view.portrait.alpha.mean() < 0.9
 
 
 def test_squares_are_parts_of_the_photo_and_many_targets_are_lit_from_behind() -> None:
@@ -77,7 +80,7 @@ def test_squares_are_parts_of_the_photo_and_many_targets_are_lit_from_behind() -
     landmarks = np.random.default_rng(0).uniform(-0.07, 0.07, (68, 3))
     subject = cast(Subject, SimpleNamespace(landmarks_world=landmarks))
     scales = np.array([1.6, 3.0, 6.5])
-    drawn = transport._draw_views(subject, scales, np.random.default_rng(1), TransportBankSettings())
+    drawn = people._draw_views(subject, scales, np.random.default_rng(1), PeopleBankSettings())
     points = torch.from_numpy(landmarks).float()
     in_photo = project(drawn.photo.to_camera(points), drawn.photo.camera).numpy()
     for sides, camera, (x0, y0, side, size) in zip(scales, drawn.squares, drawn.crops.tolist(), strict=True):
@@ -96,10 +99,12 @@ def test_squares_are_parts_of_the_photo_and_many_targets_are_lit_from_behind() -
 
 def test_what_is_seen_fits_the_truth(folder: Path, view: StoredView) -> None:
     seen = load_file(seen_path(folder / "00001_0.safetensors"))
-    person, alpha = (x[: int(seen["rows"])] for x in (1 - seen["classes"][0].float() / 255, view.alpha))
+    person, alpha = (
+        x[: int(seen["rows"])] for x in (1 - seen["classes"][0].float() / 255, view.portrait.alpha)
+    )
     both = torch.minimum(person, alpha).sum() / torch.maximum(person, alpha).sum()
     assert both > 0.7
-    assert seen["visible"].shape == (14, len(view.alpha) // 2, len(view.alpha) // 2)
+    assert seen["visible"].shape == (14, len(view.portrait.alpha) // 2, len(view.portrait.alpha) // 2)
     _, normals = albedo_of(view.portrait, view.looks[0])
     skin = seen["classes"][SKIN] > 230
     alike = (F.normalize(normals, dim=0) * seen["normals"].float()).sum(0)[skin]
@@ -110,7 +115,7 @@ def test_what_is_seen_fits_the_truth(folder: Path, view: StoredView) -> None:
 def test_what_is_seen_lies_where_the_truth_does(folder: Path, view: str) -> None:
     """In the view's own square, not in one of its own: moved by 3 pixels the classes fit worse."""
     path = folder / f"{view}.safetensors"
-    layers, truth = load_file(seen_path(path)), load_view(path).portrait.classes[..., SKIN].float() / 255
+    layers, truth = load_file(seen_path(path)), load_view(path).portrait.classes[..., SKIN]
     truth[int(layers["rows"]) :] = 0
     seen = layers["classes"][SKIN].float() / 255
     moves = [(x, y) for x in (-3, 0, 3) for y in (-3, 0, 3)]
@@ -155,40 +160,26 @@ def test_shadows_of_what_is_not_seen_fall_on_a_quarter_of_photos() -> None:
     assert sum(float(share.max() - share.min()) > 0.15 for share in shadowed) > 0.7 * len(shadowed)
 
 
-def test_phones_sharpen_and_raise_contrast(monkeypatch: pytest.MonkeyPatch) -> None:
-    step = torch.where(torch.arange(32) < 16, 0.6, 1.4).expand(3, 32, 32)
-
-    def of_step(phones: float, contrast: float) -> tuple[float, float]:
-        """The most by which a photo overshoots, and the mean difference of the sides over their mean."""
-        monkeypatch.setattr(portrait_samples, "_PHONES", phones)
-        monkeypatch.setattr(portrait_samples, "_CONTRAST", contrast)
-        photos = [portrait_samples._as_taken(step, torch.Generator().manual_seed(seed)) for seed in range(40)]
-        lines = torch.stack(photos).sqrt().mean((1, 2))
-        high, low = lines[:, 24:28].mean(1), lines[:, 4:8].mean(1)
-        overshoot = (lines[:, 16:20].amax(1) / high - 1).max()
-        return float(overshoot), float(((high - low) / (high + low)).mean())
-
-    (plain, flat), (sharp, _), (_, steep) = of_step(0, 0), of_step(1, 0), of_step(0, 1)
-    assert plain < 0.02 < 0.04 < sharp and steep > 1.02 * flat
-
-
 def test_the_network_sees_shaded_skin_in_the_colour_of_lit_skin(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    even = drawn(folder, 3)
+    seeds = range(6)
+    evened = [drawn(folder, seed) for seed in seeds]
     monkeypatch.setattr(portrait_samples, "even_shade_of", lambda image, classes: torch.ones(3, 1, 1))
-    plain = drawn(folder, 3).inputs.image[0]
-    skin = even.inputs.classes[0, BARE].sum(0)
-    factors = without_colour_of_shade(plain, skin)
-    assert factors.min() < 0.95
-    torch.testing.assert_close(even.inputs.image[0], plain * factors, rtol=1e-4, atol=1e-5)
+    least = []
+    for seed, even in zip(seeds, evened, strict=True):
+        plain = drawn(folder, seed).inputs.image[0]
+        factors = without_colour_of_shade(plain, even.inputs.classes[0, BARE].sum(0))
+        torch.testing.assert_close(even.inputs.image[0], plain * factors, rtol=1e-4, atol=1e-5)
+        least.append(float(factors.min()))
+    assert min(least) < 0.95
 
 
 def test_squares_show_what_those_of_photos_do() -> None:
     landmarks = np.random.default_rng(0).uniform(-0.07, 0.07, (68, 3))
     subject = cast(Subject, SimpleNamespace(landmarks_world=landmarks))
-    settings, random = TransportBankSettings(), np.random.default_rng(1)
-    views = [view for _ in range(60) for view in transport._draw_cameras(subject, random, settings)]
+    settings, random = PeopleBankSettings(), np.random.default_rng(1)
+    views = [view for _ in range(60) for view in people._draw_cameras(subject, random, settings)]
     assert 0.2 < np.mean([view.rows < settings.photo_px for view in views]) < 0.45
     squares = [square for view in views for square in view.squares]
     points = torch.from_numpy(landmarks).float()
@@ -220,18 +211,36 @@ def test_a_mirrored_sample_is_lit_from_the_other_side(folder: Path) -> None:
     assert torch.equal(mirrored(other).inputs.image, sample.inputs.image)
 
 
-def test_finished_people_are_kept_and_a_bank_without_portraits_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_finished_people_are_kept_and_squares_added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[int] = []
 
-    def draw(model: str, index: int, seed: int, settings: TransportBankSettings) -> Files:
+    def draw(models: list[str], seed: int, settings: PeopleBankSettings, index: int) -> Files:
         made.append(index)
-        return {f"{index:05d}_{k}": {"of": torch.tensor([index])} for k in range(settings.squares)}
+        names = [f"photo_{index:05d}_0"]
+        names += [f"{index:05d}_{k}" for k in range(settings.squares)] if settings.with_squares else []
+        return {name: {"of": torch.tensor([index])} for name in names}
 
-    monkeypatch.setattr(transport, "transport_of", draw)
+    monkeypatch.setattr(people, "bake_person", draw)
     monkeypatch.setattr(bank, "in_shards", lambda work, items, jobs: work(items))
-    add_transport(tmp_path, ["a", "b"], range(2), 1, 0, SMALL)
-    add_transport(tmp_path, ["a", "b"], range(3), 1, 0, SMALL)
-    assert made == [0, 1, 2] and len(list(tmp_path.iterdir())) == 6
+    for count, squares in ((2, False), (3, False), (3, True), (3, True)):
+        add_people(tmp_path, ["a", "b"], range(count), 1, 0, replace(SMALL, with_squares=squares))
+    assert made == [0, 1, 2, 0, 1, 2] and len(list(tmp_path.iterdir())) == 9
     refused(InputError, "no portraits", StoredTransport, tmp_path, backgrounds(), {})
+    refused(InputError, "no photos", photos_in, tmp_path / "empty")
+
+
+def test_photos_differ_by_light_and_share_their_truth(folder: Path) -> None:
+    photo = load_file(folder / "photo_00001_0.safetensors")
+    images, covered = photo["images"].float(), photo["alpha"] > 250
+    assert images.shape == (3, 3, 448, 448) and photo["landmarks_px"].shape == (68 + len(MORE_LANDMARKS), 2)
+    assert (images[0] - images[1]).abs()[:, covered].mean() > 3
+    assert (images[..., photo["alpha"] == 0] == 0).all() and images[..., covered].mean() > 10
+    face = [
+        class_index(name) for name in ("skin", "brows", "eyes", "lips", "mouth", "beard", "hand", "glasses")
+    ]
+    points = photo["landmarks_px"][27:68].long()
+    inside = points[((points >= 0) & (points < 448)).all(1)]
+    labels = photo["label"][inside[:, 1], inside[:, 0]].tolist()
+    assert len(inside) > 20 and sum(label in face for label in labels) > 0.8 * len(labels)
+    assert (photo["points_px"][17:] - photo["landmarks_px"][17:68]).abs().max() < 1e-3
+    assert read_photo(photos_in(folder)[0][0], torch.Generator()).radiance.shape == (3, 448, 448)
