@@ -79,7 +79,7 @@ def bake_transport(
             numbers = random.random((len(lit), 1)), random.random((len(lit), 1))
             rays = on_disc(direction, places_on_disc(settings.light_radius_deg, *numbers))
             visibility[light, lit] += ~occluded(scene, origins[lit], rays)
-    visibility /= np.float32(settings.light_samples)
+    visibility /= settings.light_samples
 
     direct = visibility * np.clip(directions.astype(np.float32) @ facing.T, 0, None)  # [L, N]
     corners, nearest_texel = vertices[triangles], cKDTree(places)
