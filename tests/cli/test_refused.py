@@ -47,11 +47,11 @@ def place(tmp_path_factory: Folders) -> Path:
 
 WRONG: dict[str, dict[str, str]] = {
     "": {
-        "nonsense": "No such command 'nonsense'. (a verb comes first",
+        "nonsense": "No such command 'nonsense'. (a command comes first",
         "--nonsense": "No such option: --nonsense",
         "doctor --nonsense": "see 'facerf doctor --help'",
         "--seed x doctor": "Invalid value for '--seed'",
-        "--device abacus doctor": "--device abacus: not the name of a device; give auto,",
+        "--device abacus doctor": "--device abacus: not the name of a device; use auto,",
         "-v -q doctor": "-v and -q: contradict each other",
         "--seed": "'--seed' requires an argument",
         "-v": "Missing command",
@@ -112,7 +112,7 @@ WRONG: dict[str, dict[str, str]] = {
         "--format exr,tiff --view none": "--view is for png, png16, jpg; add that to --format",
         "--format tiff --compression zip": "--compression is for exr; add that to --format",
         "--format png --quality 90": "--quality is for jpg",
-        "-o me.gif": "me.gif: is a file's name; give a folder",
+        "-o me.gif": "me.gif: names a file; use a folder",
         "-o who.csv/out": "cannot be written to",
         "-o two.png --light 9,9": "-o two.png: is ",
         "-o wrong.png --format exr": "-o wrong.png: is ",
@@ -140,18 +140,18 @@ WRONG: dict[str, dict[str, str]] = {
     },
     "segment a.jpg": {
         "-o me.jpg": "or a file as .png or .exr",
-        "-o me.JSON": "me.JSON: is a file's name; give a folder",
-        "-o me.png --face all": "is one file",
-        "-o me.png b.jpg": "is one file",
+        "-o me.JSON": "me.JSON: names a file; use a folder",
+        "-o me.png --face all": "a single file",
+        "-o me.png b.jpg": "a single file",
         "-o me.png --name {stem}": "--name: is not for",
-        "-o a.JPG": "is a file's name",
+        "-o a.JPG": "names a file",
         "--person none.png": "no such file or folder",
     },
     "fit-geometry a.jpg": {
         "--geometry network --landmarks who.csv": "--landmarks: --geometry network uses none",
         "--landmarks none": "no such file or folder",
     },
-    "view": {"a.jpg b.jpg -o me.html": "is one file", "index": "rename the photo"},
+    "view": {"a.jpg b.jpg -o me.html": "a single file", "index": "rename the photo"},
     "envmap": {"--kind moon": "moon", "--size 33": "--size", "--count 0": "--count"},
     "prepare-dataset stage": {
         "--split 300/10/40": "the capture has 2",
@@ -165,7 +165,7 @@ WRONG: dict[str, dict[str, str]] = {
     "relight-dataset data --per-subject 4": {
         "--envmaps empty": "empty: no inputs found (looked for .exr .hdr)",
         "--envmaps procedural:999999999": "give at most 1000000",
-        "--envmaps procedural:3 --memory inf": "--memory inf: not a size; give a number",
+        "--envmaps procedural:3 --memory inf": "--memory inf: not a size; pass a number",
         "--envmaps nowhere": "--envmaps nowhere: no such folder",
     },
     "train": {
@@ -186,7 +186,7 @@ WRONG: dict[str, dict[str, str]] = {
         "--preset paper --dataset d --vgg-weights v --appearance-features a": "takes the place of",
         "--preset paper --dataset data": "--vgg-weights imagenet ... --light-features FILE ... --crop 512",
         f"--checkpoint {SHIPPED['parsing']}": "holds a Parsing Network ... uses no network",
-        f"--checkpoint {SHIPPED['portrait']}": "holds a Portrait Network ... uses the Parsing",
+        f"--checkpoint {SHIPPED['portrait']}": "holds a Portrait Network ... uses no network",
         "--heads 13": "--heads 13: the mean face and 12 heads are held out; give more",
         "--stage parsing --preset tiny --heads 4": "4 people are held out; give more",
         **{
