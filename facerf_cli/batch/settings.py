@@ -147,7 +147,7 @@ def folder_not_file(output: Path, other: str = "") -> Path:
     if _FILE_SUFFIX.fullmatch(output.suffix) and not output.is_dir():
         kinds = f", or a file with the suffix {other}" if other else ""
         folder = f"use a folder, such as -o {output.with_suffix('')}"
-        raise UsageError(f"-o {output}: the name of a file; {folder}{kinds}")
+        raise UsageError(f"-o {output}: names a file; {folder}{kinds}")
     return output
 
 

@@ -60,7 +60,7 @@ def test_a_file_that_is_read_is_no_output(
         link(folder / read, output)
     before = (folder / read).read_bytes()
     assert main([*line.format(output).split(), *(["--dry-run"] if dry else [])]) == 2
-    assert f"-o {output}: is the input {read}; give another name or folder" in capsys.readouterr().err
+    assert f"-o {output}: is the input {read}; use another name or folder" in capsys.readouterr().err
     assert (folder / read).read_bytes() == output.read_bytes() == before
     assert not list(folder.glob("*.jsonl")) and not list(folder.glob(".*"))
 
