@@ -15,15 +15,12 @@ from collections import deque
 from collections.abc import Callable, Generator, Sequence
 from contextlib import chdir
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from facerf_cli._version import __version__
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.run.logs import LOGGER_NAME, log_to_queue, one_line
 from facerf_cli.run.machine import processors
-
-if TYPE_CHECKING:
-    from facerf_cli.run.workers import Workers
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -48,18 +45,20 @@ log = logging.getLogger(LOGGER_NAME)
 def in_ray(
     work: Callable[[T], R],
     items: Sequence[T],
-    workers: "Workers",
     died: Callable[[T, Exception], R],
+    address: str,
+    jobs: int = 0,
+    gpus: int | None = None,
 ) -> Generator[tuple[int, R]]:
     """Yield the number and result of each item as they come.
 
-    A task has one processor, one thread and `workers.gpus` GPUs. An item whose worker is lost is tried twice
-    more. Raises UsageError if Ray is not installed, or does not run at the address.
+    A task has one processor, one thread and `gpus` GPUs; None: one if the cluster has any. At most `jobs`
+    tasks run at a time; 0: as many as Ray has processors. An item whose worker is lost is tried twice more.
+    Raises UsageError if Ray is not installed, or does not run at the address.
     """
-    address = workers.ray or "local"
-    ray = connect(address, workers.jobs)
+    ray = connect(address, jobs)
     resources = ray.cluster_resources()
-    gpus = int(resources.get("GPU", 0) >= 1) if workers.gpus is None else workers.gpus
+    gpus = int(resources.get("GPU", 0) >= 1) if gpus is None else gpus
     for name, needed in (("CPU", 1), ("GPU", gpus)):
         if resources.get(name, 0) < needed:  # a cluster that grows may yet get it
             log.warning("the Ray cluster has no %s now; tasks wait for one", name)
@@ -71,7 +70,7 @@ def in_ray(
     try:
         while waiting or running:
             # A cluster may grow.
-            at_once = workers.jobs or 2 * max(1, int(ray.cluster_resources().get("CPU", 1)))
+            at_once = jobs or 2 * max(1, int(ray.cluster_resources().get("CPU", 1)))
             while waiting and len(running) < at_once:
                 number, attempt = waiting.popleft()
                 running[task.remote(shared, items[number], site)] = number, attempt

@@ -60,7 +60,7 @@ def spread(
     if workers.ray is not None and items:
         from facerf_cli.run.ray_workers import in_ray
 
-        results = in_ray(work, items, workers, died)
+        results = in_ray(work, items, died, workers.ray, workers.jobs, workers.gpus)
     elif workers.jobs > 1 and len(items) > 1:
         results = in_processes(work, items, workers, died)
     else:

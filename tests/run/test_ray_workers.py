@@ -18,7 +18,6 @@ from facerf_cli.batch.settings import Shard
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.run.logs import configure_logging
 from facerf_cli.run.ray_workers import _initialise, connect, in_ray
-from facerf_cli.run.workers import Workers
 from tests.batch.toy_batch import run
 from tests.folders import rows
 from tests.processes import wait_until
@@ -242,7 +241,7 @@ def test_a_lost_cluster_is_one_line_that_says_what_to_do(when: str, monkeypatch:
     with pytest.raises(
         FacerfError, match=r"^--ray a:1: the cluster was lost \(The node died\); start it again"
     ):
-        list(in_ray(str, ["item"], Workers(1, "a:1", 0), lambda item, error: item))
+        list(in_ray(str, ["item"], lambda item, error: item, "a:1", 1, 0))
 
 
 def test_a_temporary_folder_too_deep_for_sockets_is_one_line() -> None:
