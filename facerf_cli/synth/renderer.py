@@ -173,17 +173,13 @@ class BakedView:
     lens_views: Tensor
 
     @property
-    def side_px(self) -> int:
-        return len(self.classes)
-
-    @property
     def alpha(self) -> Tensor:
         """Matte of the person [S, S]."""
         return 1 - self.classes[..., 0]
 
     def summed(self, columns: Tensor) -> Tensor:
         """Sum values [N, C] of the facets over the pixels [S * S, C], weighted by their shares."""
-        total = torch.zeros(self.side_px**2, columns.shape[1])
+        total = torch.zeros(self.alpha.numel(), columns.shape[1])
         return total.index_add_(0, self.pixel.long(), columns * self.share[:, None])
 
     def packed(self) -> dict[str, Tensor]:
@@ -260,7 +256,7 @@ def materials_of(view: BakedView, appearance: Appearance) -> Material:
 def albedo_of(view: BakedView, surface: Material) -> tuple[Tensor, Tensor]:
     """Return albedo and normals [3, S, S] of a view with materials [N]; both are times its coverage."""
     summed = view.summed(torch.cat([surface.albedo, view.normals], 1))
-    albedo, normals = summed.T.reshape(2, 3, view.side_px, view.side_px)
+    albedo, normals = summed.T.reshape(2, 3, *view.alpha.shape)
     return albedo, normals
 
 
@@ -343,15 +339,15 @@ class _Shading:
         mirrored, transmitted = reflections(self.lenses, self.view.directions)
         at = self.lenses.pixels
         pixels[at] = pixels[at] * transmitted[:, None] + mirrored @ weights
-        return pixels.T.reshape(3, self.view.side_px, self.view.side_px)
+        return pixels.T.reshape(3, *self.view.alpha.shape)
 
 
 def _scattering_kernels(view: BakedView, skin: np.ndarray) -> list[list[csr_matrix]]:
     """Build matrices [n, n] per channel that scatter light among n facets of skin, along rows and columns."""
-    side, positions_m = view.side_px, view.positions_m.numpy()[skin]
+    (height, width), positions_m = view.alpha.shape, view.positions_m.numpy()[skin]
     share = view.share.numpy()[skin]
     pixel = view.pixel.numpy()[skin]
-    facet_in = np.full((side, side), -1)
+    facet_in = np.full((height, width), -1)
     facet_in.ravel()[pixel] = np.arange(len(skin))
     sigmas_m = view.scattering_m.tolist()
     both = (facet_in[:, 1:] >= 0) & (facet_in[:, :-1] >= 0)
@@ -367,9 +363,9 @@ def _scattering_kernels(view: BakedView, skin: np.ndarray) -> list[list[csr_matr
         for down, right in blurs:
             rows, columns, values = [], [], []
             for step in range(-reach, reach + 1):
-                y, x = pixel // side + step * down, pixel % side + step * right
-                inside = (y >= 0) & (y < side) & (x >= 0) & (x < side)
-                near = np.where(inside, facet_in[y.clip(0, side - 1), x.clip(0, side - 1)], -1)
+                y, x = pixel // width + step * down, pixel % width + step * right
+                inside = (y >= 0) & (y < height) & (x >= 0) & (x < width)
+                near = np.where(inside, facet_in[y.clip(0, height - 1), x.clip(0, width - 1)], -1)
                 on = np.flatnonzero(near >= 0)
                 squared = ((positions_m[near[on]] - positions_m[on]) ** 2).sum(1)
                 rows.append(on)
