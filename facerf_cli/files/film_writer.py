@@ -1,5 +1,6 @@
 """Videos written by PyAV from images, with another video's sound: H.264 in .mp4, ProRes in .mov."""
 
+import io
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +16,7 @@ import numpy as np
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.film import BT709, Timing, exact, reason, require_av, start_s
+from facerf_cli.files.film import BT709, Film, Timing, exact, reason, require_av, start_s
 from facerf_cli.files.read import PHOTO_LIMIT_PX, decode
 from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear, unit_floats
 from facerf_cli.run.logs import LOGGER_NAME
@@ -53,11 +54,23 @@ _ALPHA_FORM = replace(
 )
 
 
+def check_writable(path: Path, source: Path) -> None:
+    """Raise InputError, before frames are rendered, if a video cannot have the sound of another."""
+    av, film = require_av(path), Film(source)
+    try:
+        with av.open(io.BytesIO(), "w", format=path.suffix[1:].lower()) as container:
+            _begin(av, container, _FORMS[path.suffix.lower()], film.read(0).shape[:2], film.timing)
+            container.start_encoding()
+    except (av.error.FFmpegError, ValueError) as error:
+        raise InputError(
+            f"{source}: its sound cannot be written to {path} ({reason(error)}); convert it to AAC"
+        ) from None
+
+
 def write_film(path: Path, images: Sequence[Path], timing: Timing, comment: str) -> None:
     """Write PNG images as a video atomically; `comment` goes into its metadata.
 
-    .mov keeps alpha in ProRes 4444, .mp4 shows the images over black. Raises InputError if FFmpeg cannot
-    write the sound.
+    .mov keeps alpha in ProRes 4444, .mp4 shows the images over black.
     """
     av, form = require_av(path), _FORMS[path.suffix.lower()]
     if decode(images[0], PHOTO_LIMIT_PX).alpha is not None:
@@ -79,16 +92,11 @@ def write_film(path: Path, images: Sequence[Path], timing: Timing, comment: str)
         yield inf, stream.encode(None)
 
     options = {"movflags": "+faststart"}
-    try:
-        with atomic_path(path) as temporary, av.open(str(temporary), "w", options=options) as container:
-            container.metadata["comment"] = comment
-            stream, sound = _begin(av, container, form, _pixels(images[0], form).shape[:2], timing)
-            for _, packets in merge(encoded(stream), sound, key=itemgetter(0)):
-                container.mux(packets)
-    except av.error.FFmpegError as error:
-        raise InputError(
-            f"{path}: cannot be written ({reason(error)}); convert the sound of the video to AAC"
-        ) from None
+    with atomic_path(path) as temporary, av.open(str(temporary), "w", options=options) as container:
+        container.metadata["comment"] = comment
+        stream, sound = _begin(av, container, form, _pixels(images[0], form).shape[:2], timing)
+        for _, packets in merge(encoded(stream), sound, key=itemgetter(0)):
+            container.mux(packets)
 
 
 def _begin(

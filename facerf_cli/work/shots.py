@@ -253,7 +253,11 @@ class FilmOutput:
         if batch.dry_run:
             print(named(f"{items[0].input_path} -> {self.path}"))
             return ""
-        if not film and len({_stated(item, self.rate)[0] for item in items}) > 1:
+        if film:
+            from facerf_cli.files.film_writer import check_writable
+
+            check_writable(self.path, film)
+        elif len({_stated(item, self.rate)[0] for item in items}) > 1:
             log.warning("%s: frames state different rates; using the first one's (--fps)", self.path)
         return recipe
 

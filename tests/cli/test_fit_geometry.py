@@ -139,7 +139,7 @@ def test_bad_landmarks_name_the_photo(tmp_path: Path, capsys: Capture) -> None:
         (None, "--landmarks has no "),
         ("[]", "landmarks"),
         ("{", "landmarks"),
-        (json.dumps([[5, 5]] * 68), "one spot"),
+        (json.dumps([[5, 5]] * 68), "on one point or line"),
         (json.dumps(outside), "outside the image"),
     ):
         if content is not None:

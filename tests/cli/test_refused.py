@@ -126,8 +126,8 @@ WRONG: dict[str, dict[str, str]] = {
     "segment a.jpg": {
         "-o me.jpg": "-o me.jpg: ... the suffix .png or .exr",
         "-o me.JSON": "-o me.JSON: ... use a folder",
-        "-o me.png --face all": "-o me.png: ... a folder with -o",
-        "-o me.png b.jpg": "-o me.png: ... a folder with -o",
+        "-o me.png --face all": "-o me.png: ... use one photo, face and light",
+        "-o me.png b.jpg": "-o me.png: ... use one photo, face and light",
         "-o me.png --name {stem}": "--name: ... remove it",
         "-o a.JPG": "-o a.JPG: ... use a folder",
         "--person none.png": "no such file or folder",
@@ -136,7 +136,10 @@ WRONG: dict[str, dict[str, str]] = {
         "--geometry network --landmarks who.csv": "--landmarks: ... remove one",
         "--landmarks none": "no such file or folder",
     },
-    "view": {"a.jpg b.jpg -o me.html": "-o me.html: ... a folder with -o", "index": "rename the photo"},
+    "view": {
+        "a.jpg b.jpg -o me.html": "-o me.html: ... use one photo, face and light",
+        "index": "rename the photo",
+    },
     "envmap": {"--kind moon": "moon", "--size 33": "--size", "--count 0": "--count"},
     "prepare-dataset stage": {
         "--split 300/10/40": "the capture has 2",

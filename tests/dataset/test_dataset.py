@@ -73,7 +73,7 @@ def lights_said(lights: list[str]) -> dict[str, Any]:
     [
         ({"format": "other"}, "facerf-dataset-1"),
         ({"crop_px": 1e9}, "crop_px"),
-        ({"rig": {"lights": []}}, "rig: lights is ... at least 1"),
+        ({"rig": {"lights": []}}, "rig: lights: ... at least 1"),
         ({"rig": {"lights": [{"id": "L0", "direction_world": [1, 1, 1]}]}}, "length 1"),
         ({"rig": {"lights": [{"id": "L0", "direction_world": [float("nan"), 0, 0]}]}}, "finite"),
         ({"splits": {"train": ["0000"], "validation": ["0000"], "test": []}}, "one split only"),

@@ -75,7 +75,7 @@ def test_crops_hold_their_landmarks_and_no_face_at_all_is_an_error(folder: Path)
     assert full.min() > 0 and full.max() < 1 and (full[:, :, 0].amax(1) - full[:, :, 0].amin(1)).min() > 0.4
     records = [json.loads(path.read_text()) for path in (folder / "cache").glob("*.json")]
     assert sum(record["landmarks_px"] is None for record in records) == 1
-    with pytest.raises(InputError, match="--photos: no face in any of 1 photos; give"):
+    with pytest.raises(InputError, match="--photos: no face in any of 1 photos; use"):
         open_photos([folder / "c.png"], folder / "cache", SHIPPED_NETWORKS, 64)
 
 

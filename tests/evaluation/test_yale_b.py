@@ -138,7 +138,9 @@ def test_every_method_relights_every_case(small: YaleB, monkeypatch: pytest.Monk
     monkeypatch.setattr(yale_b, "ENVIRONMENTS", ("env_sky",))
     monkeypatch.setattr(yale_b, "_SOFT_TARGETS", (Flash(0, 0), Flash(-70, 0)))
     monkeypatch.setattr(people, "find_faces", lambda *_: [someone()])
-    monkeypatch.setattr(Person, "share", property(lambda person: np.ones(person.photo.shape[:2], np.float32)))
+    monkeypatch.setattr(
+        Person, "matte_array", property(lambda person: np.ones(person.photo.shape[:2], np.float32))
+    )
     monkeypatch.setattr(people, "head_of", lambda *given: fits.update(["fitted"]) or head_of(*given))
     flat = np.full((192, 168), 128)  # an image without detail: the prediction is the method's own
     write_pgm(small.folder / "yaleB07" / "yaleB07_P00A+000E+00.pgm", flat)

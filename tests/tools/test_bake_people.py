@@ -24,5 +24,5 @@ def test_finished_people_are_kept_in_a_row(tmp_path: Path) -> None:
 
 
 def test_nobody_is_begun_when_the_time_is_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bake_people, "transport_of", lambda *_: pytest.fail("a person is baked"))
+    monkeypatch.setattr(bake_people, "bake_person", lambda *_: pytest.fail("a person is baked"))
     assert bake_people.bake(tmp_path, ["builtin"], torch.zeros(1), time.time() - 1, 3) is None

@@ -65,7 +65,7 @@ def test_a_dataset_holds_the_arrays_in_the_crop_of_the_face(page: dict[str, Any]
     ("people", "directions", "said"),
     [
         ({}, FRONT, "people"),
-        ({"a/b": np.zeros((2, 8, 8, 3))}, FRONT, "people[0] is 'a/b'; a name"),
+        ({"a/b": np.zeros((2, 8, 8, 3))}, FRONT, "people[0]: use a name"),
         ({"a": np.zeros((2, 8, 8))}, FRONT, "use [2, height, width, 3]"),
         ({"a": np.zeros((3, 8, 8, 3))}, FRONT, "[3, 8, 8, 3]"),
         ({"a": np.zeros((2, 8, 8, 3))}, FRONT[0], "directions[0]"),
