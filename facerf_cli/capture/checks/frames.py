@@ -127,9 +127,7 @@ def check_missing(capture: Capture, subject: str, camera: str) -> Iterator[Findi
         yield Finding("error", "missing", subject, f"{paths[light]}: no such file; copy it", camera, light)
     if extra := extra_names(capture, subject, camera):
         names = ", ".join(extra[:_LISTED]) + (", ..." if len(extra) > _LISTED else "")
-        words = (
-            f"{len(extra)} files belong to no light ({names}); list their lights, or remove them"
-        )
+        words = f"{len(extra)} files belong to no light ({names}); list their lights, or remove them"
         yield Finding("warning", "extra", subject, words, camera, figures={"files": len(extra)})
 
 
