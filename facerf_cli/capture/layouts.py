@@ -34,7 +34,5 @@ def read_capture(folder: Path, settings: ReadSettings = _AS_STORED) -> Capture:
         raise InputError(f"{folder}: no such folder; use the folder of a capture")
     capture = LAYOUTS[settings.layout](folder)
     if settings.subtract_ambient and not capture.ambient_pattern:
-        raise UsageError(
-            f"--subtract-ambient: {folder / STAGE_FILE} names no 'ambient' images; add them, or remove the option"
-        )
+        raise UsageError(f"--subtract-ambient: {folder / STAGE_FILE} names no 'ambient' images; add them")
     return replace(capture, subtract_ambient=settings.subtract_ambient)

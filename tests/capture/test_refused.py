@@ -44,7 +44,7 @@ def camera(**changes: Any) -> dict[str, Any]:
         (light(intensity=[1, 0, 1]), "lights[0]: intensity"),
         (light(id="L1"), "'L1'"),
         (light(id="../L0"), "a name"),
-        (light(position=[0, 0, 1]), "either 'direction' or 'position'"),
+        (light(position=[0, 0, 1]), "direction"),
         ({"lights": [{"id": "L0", "position": [0, 0, 0], "intensity": [1, 1, 1]}]}, "L0"),
         (camera(width=10**9), "cameras[0]: width"),
         (camera(K=[[1, 0], [0, 1]]), "3 x 3"),
