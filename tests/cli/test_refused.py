@@ -170,8 +170,8 @@ WRONG: dict[str, dict[str, str]] = {
         "--geometry landmarks": "--geometry: does not apply to the stage reflectance",
         "--preset paper --dataset d --vgg-weights v --appearance-features a": "use one of them",
         "--preset paper --dataset data": "--vgg-weights imagenet ... --light-features FILE",
-        f"--checkpoint {SHIPPED['parsing']}": "holds a Parsing Network ... uses no network",
-        f"--checkpoint {SHIPPED['portrait']}": "holds a Portrait Network ... uses no network",
+        f"--checkpoint {SHIPPED['parsing']}": "Parsing Network ... uses no network",
+        f"--checkpoint {SHIPPED['portrait']}": "Portrait Network ... uses no network",
         "--heads 13": "--heads 13: the mean face and 12 heads are held out; use more",
         "--stage parsing --preset tiny --heads 4": "4 people are held out; use more",
         **{
