@@ -106,6 +106,7 @@ def save_networks(path: Path, networks: Mapping[str, nn.Module], metadata: dict[
     Raises UsageError for a user's class that `use_form` has not registered.
     """
     tensors, described = {}, {}
+    network: Any
     for name, network in networks.items():
         if type(network) not in _CLASSES.values():
             raise UsageError(f"{type(network).__name__}: unknown network; call use_form with its name")
