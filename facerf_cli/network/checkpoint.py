@@ -100,13 +100,13 @@ def new_network(name: str, form: str, settings: Mapping[str, Any]) -> Any:
     return _CLASSES[name, form].from_metadata({"form": form, **settings})
 
 
-def save_networks(path: Path, networks: Mapping[str, nn.Module], metadata: dict[str, Any]) -> None:
+def save_networks(path: Path, networks: Mapping[str, Any], metadata: dict[str, Any]) -> None:
     """Write networks by name, with their form and settings and other metadata.
 
     Raises UsageError for a user's class that `use_form` has not registered.
     """
-    tensors, described = {}, {}
-    network: Any
+    tensors: dict[str, Tensor] = {}
+    described: dict[str, Any] = {}
     for name, network in networks.items():
         if type(network) not in _CLASSES.values():
             raise UsageError(f"{type(network).__name__}: unknown network; call use_form with its name")
@@ -171,7 +171,7 @@ def _restore(name: str, described: dict[str, Any], tensors: dict[str, Tensor]) -
     """Make the network described by metadata and load its tensors; raises RuntimeError if they do not fit."""
     form = described["form"]
     if (name, form) not in _CLASSES and ":" in form:
-        raise UsageError(f"its network is {form}, code of your own; use --form {form}")
+        raise UsageError(f"its network is the custom class {form}; use --form {form}")
     with _WithoutInitialValues():
         network: nn.Module = _CLASSES[name, form].from_metadata(described)
     prefix = f"{name}."

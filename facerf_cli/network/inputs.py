@@ -123,7 +123,7 @@ def from_root(root: Tensor) -> Tensor:
 
 
 def resize(x: Tensor, side: int) -> Tensor:
-    """Resample [B, C, H, W] to a side: by averages if it is smaller, bilinearly if it is larger."""
+    """Resample [B, C, H, W] to a side: by averages for a smaller one, bilinearly for a larger one."""
     if x.shape[-1] == side:
         return x
     if x.shape[-1] > side:
@@ -237,7 +237,7 @@ class SavedNetwork(nn.Module):
 
 
 def mixed_precision(device: torch.device, wanted: bool) -> torch.autocast:
-    """Return a context in which a network computes in bfloat16, if that is `wanted`.
+    """Return a context for bfloat16 computations, if that is `wanted`.
 
     Processors without bfloat16 instructions emulate them a hundred times more slowly, and old GPUs lack them.
     There the network stays in float32, which is logged once.
