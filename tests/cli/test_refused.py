@@ -142,7 +142,7 @@ WRONG: dict[str, dict[str, str]] = {
         "--split 300/10/40": "the capture has 2",
         "--split half": "--split",
         "--crop 97": "--crop",
-        "--layout multipie": "there is extended-yale-b, faceolat, faceolat-linear, stage",
+        "--layout multipie": "extended-yale-b, faceolat, faceolat-linear, stage",
         "--checks only --shard 1/2": "--shard: --checks only checks all subjects; use --jobs or --ray",
         "--pattern x": "--pattern requires --describe",
     },
@@ -154,7 +154,7 @@ WRONG: dict[str, dict[str, str]] = {
         "--envmaps nowhere": "--envmaps nowhere: no such folder",
     },
     "train": {
-        "--form cubist": "form cubist: no such Reflectance Network; give one of default, paper",
+        "--form cubist": "form cubist: ... default, paper",
         "--dataset d --heads 20": "--heads: ... use one",
         "--dataset d --heads-from builtin": "--heads-from: ... use one",
         "--texture-size 64": "--texture-size: ... add --dataset",
