@@ -1,7 +1,7 @@
-"""A light-stage capture on disk: lights, calibrated cameras, and its frames in linear light.
+"""Light-stage capture on disk: lights, calibrated cameras, and frames in linear light.
 
-Path patterns name the frames: {subject}, {camera} and {light} stand for parts of their paths. The distortion
-of a lens, by OpenCV's coefficients, is undone where a frame is read.
+Path patterns name the frames: {subject}, {camera} and {light} stand for parts of their paths. Reading a frame
+removes lens distortion, which is given by OpenCV's coefficients.
 """
 
 import re
@@ -22,27 +22,26 @@ from facerf_cli.files.read import read_image
 from facerf_cli.raster.camera import PosedCamera
 
 FIELDS = ("subject", "camera", "light")
-FULL_NAMES = ("full", "full_on", "fullon", "all", "all_on")  # in a light's place: a frame with all lights on
-_AMBIENT_WORDS = ("ambient", "dark", "black", "room", "background")  # there, too: a frame without lights
-_RESERVED = r"{}\:*?"  # wildcards of patterns, and characters that file names cannot have everywhere
+_FULL_NAMES = ("full", "full_on", "fullon", "all", "all_on")  # in place of a light: a frame with all lights
+_AMBIENT_WORDS = ("ambient", "dark", "black", "room", "background")  # in place of a light: a frame without
+_RESERVED = r"{}\:*?"  # wildcards of patterns, and characters that some file systems forbid
 _LONGEST = 500
 BlackLevel = float | tuple[float, float, float]
-Coefficients = tuple[float, ...]  # k1, k2, p1, p2 and, where there are five, k3
-_STEPS = 64  # of the radius along which a lens is examined
+Coefficients = tuple[float, ...]  # k1, k2, p1, p2 and optionally k3
+_STEPS = 64  # radii at which a lens is examined
 
 
 @dataclass(frozen=True)
 class ChartCorrection:
-    """Colour correction of some cameras by a chart's image."""
+    """Colour correction of one or more cameras, from a chart's image."""
 
     image: Path
-    # Its entry in `dataset.json`: cameras; matrix [3, 3] on linear Rec.709 under a light of rgb 1, which
-    # keeps the luminance of neutral colours; corners of the patches' area, clockwise from the dark skin
-    # patch; CIE delta E 2000 of the 24 patches; span of the light on the chart; name of the control image.
+    # Entry in `dataset.json`: cameras; matrix [3, 3] for linear Rec.709 under a light of rgb 1, which keeps
+    # the luminance of neutral colours; corners of the patches' area; CIE delta E 2000 of the 24 patches.
     record: Mapping[str, Any]
 
     def in_words(self) -> str:
-        """Log line with the colour errors before and after."""
+        """Return the log line with the colour errors before and after."""
         before, after = (self.record["delta_e_2000"][when] for when in ("before", "after"))
         return (
             f"{self.image}: colour chart of {', '.join(self.record['cameras'])}: CIE delta E 2000 mean "
@@ -51,7 +50,7 @@ class ChartCorrection:
 
 
 def correct_colours(charts: Iterable[ChartCorrection], camera: str, linear: np.ndarray) -> np.ndarray:
-    """Apply the matrix of a camera's chart to a frame [H, W, 3], linear Rec.709, float32; if it has one."""
+    """Apply the matrix of a camera's chart, if it has one, to a frame [H, W, 3], linear Rec.709, float32."""
     for chart in charts:
         if camera in chart.record["cameras"]:
             return linear @ np.array(chart.record["matrix"], np.float32).T
@@ -59,7 +58,7 @@ def correct_colours(charts: Iterable[ChartCorrection], camera: str, linear: np.n
 
 
 class FrameSizeError(InputError):
-    """A frame is not of its camera's size."""
+    """A frame's size differs from its camera's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,36 +75,31 @@ class Capture:
     cameras: dict[str, PosedCamera]
     subjects: dict[str, dict[str, Any]]  # traits by subject, sorted
     provenance: dict[str, Any]
-    # Images without any light, with {subject} and {camera}; empty where there are none.
-    ambient_pattern: str = ""
+    ambient_pattern: str = ""  # of images without any light, with {subject} and {camera}
     subtract_ambient: bool = False
-    # By subject, the ids of the lights whose frames the capture itself declares damaged.
+    # Ids of the lights, by subject, whose frames the capture itself declares damaged.
     marked: Mapping[str, frozenset[str]] = field(default_factory=dict)
-    distortion: Mapping[str, Coefficients] = field(
-        default_factory=dict
-    )  # of the cameras whose lenses distort
-    charts: tuple[ChartCorrection, ...] = ()  # corrections of the cameras by photographed colour charts
-    colour_matrix: np.ndarray | None = None  # [3, 3], on linear values without the black level
-    positions_m: np.ndarray | None = None  # [L, 3] of near lights, in the world; NaN of far ones
-    centre_m: np.ndarray = field(default_factory=lambda: np.zeros(3))  # [3], to which near light is measured
-    stops: Mapping[str, float] = field(default_factory=dict)  # by which a subject's frames are brighter
-    ignored: frozenset[str] = frozenset()  # names in a light's place that are of no single light
+    distortion: Mapping[str, Coefficients] = field(default_factory=dict)  # by camera
+    charts: tuple[ChartCorrection, ...] = ()
+    colour_matrix: np.ndarray | None = None  # [3, 3], for linear values without the black level
+    positions_m: np.ndarray | None = None  # [L, 3] of near lights, in the world; NaN for far ones
+    centre_m: np.ndarray = field(default_factory=lambda: np.zeros(3))  # [3], where intensities are measured
+    stops: Mapping[str, float] = field(default_factory=dict)  # extra exposure of a subject's frames
+    ignored: frozenset[str] = frozenset()  # names in a light's place that belong to no single light
 
     def frame_path(self, subject: str, camera: str, light: str) -> Path:
-        """Path of the frame of a subject seen by a camera under one light."""
+        """Return the path of a subject's frame in a camera under one light."""
         return self.folder / self.pattern.format(subject=subject, camera=camera, light=light)
 
     def has_frame(self, subject: str, camera: str, light: str) -> bool:
-        """True where the frame of a subject exists."""
         return self.frame_path(subject, camera, light).is_file()
 
     def frame(self, subject: str, camera: str, light: int) -> np.ndarray:
         """Read a frame [H, W, 3] as under a light of rgb 1, linear Rec.709, float32.
 
-        The colour chart's correction is applied and the lens's distortion undone. NaN and infinite values
-        become 0, with a warning. Values below the black level, from noise or a wide gamut,
-        stay negative here so that sums have no bias. InputError for a file that cannot be read,
-        FrameSizeError for one that has not the camera's size.
+        Applies the colour chart's correction and removes the lens's distortion. NaN and infinite values
+        become 0, with a warning. Values below the black level, from noise or a wide gamut, stay negative so
+        that sums have no bias. Raises InputError for an unreadable file, FrameSizeError for another size.
         """
         path = self.frame_path(subject, camera, self.light_ids[light])
         pixels = read_frame(path, self.colour_space)
@@ -113,7 +107,7 @@ class Capture:
         if pixels.shape[:2] != (posed.height_px, posed.width_px):
             raise FrameSizeError(
                 f"{path}: {pixels.shape[1]} x {pixels.shape[0]} pixels, but camera {camera} has "
-                f"{posed.width_px} x {posed.height_px}; give frames of one size, or correct the camera"
+                f"{posed.width_px} x {posed.height_px}; use frames of one size, or correct the camera"
             )
         ambient = self.ambient(subject, camera) if self.subtract_ambient else None
         exposed = np.float32(2.0 ** self.stops.get(subject, 0.0)) * self.intensities[light].astype(np.float32)
@@ -122,14 +116,14 @@ class Capture:
         return undistorted(lit, posed, self.distortion[camera]) if camera in self.distortion else lit
 
     def without_dark(self, pixels: np.ndarray, ambient: np.ndarray | None = None) -> np.ndarray:
-        """Values [..., 3] without the black level, or an ambient image, in the colours of the matrix."""
+        """Subtract the black level or an ambient image from values [..., 3], and apply `colour_matrix`."""
         linear = pixels - (np.asarray(self.black_level, np.float32) if ambient is None else ambient)
         return linear if self.colour_matrix is None else linear @ self.colour_matrix.T.astype(np.float32)
 
     def about(self, head_m: np.ndarray) -> "Capture":
-        """The capture with its near lights as a head at [3] in the world receives them.
+        """Return a copy with near lights as received at a point [3] in the world.
 
-        A near light is weaker by the square of its distance, and shines along the line to the head.
+        A near light's intensity falls with the square of the distance; its direction is toward the light.
         """
         if self.positions_m is None:
             return self
@@ -143,9 +137,9 @@ class Capture:
         return replace(self, directions_world=directions, intensities=intensities, centre_m=head_m)
 
     def ambient(self, subject: str, camera: str) -> np.ndarray | None:
-        """Read a subject's image without any light [H, W, 3], black level included.
+        """Read a subject's image without any light [H, W, 3], including the black level.
 
-        None where there is none, or none of the camera's size.
+        Returns None if it does not exist or differs from the camera's size.
         """
         path = self.folder / self.ambient_pattern.format(subject=subject, camera=camera)
         pixels = _read_ambient(path, self.colour_space) if self.ambient_pattern and path.is_file() else None
@@ -159,15 +153,15 @@ def read_frame(path: Path, colour_space: str) -> np.ndarray:
     return image.pixels if image.alpha is None else image.pixels * image.alpha[..., None]
 
 
-_read_ambient = lru_cache(maxsize=2)(read_frame)  # every frame of a camera needs the same one
+_read_ambient = lru_cache(maxsize=2)(read_frame)  # shared by all frames of a camera
 
 
 def require_pattern(
     pattern: str, where: str, needed: Collection[str], fields: tuple[str, ...] = FIELDS
 ) -> str:
-    """Return a pattern; an InputError says `where` one stands that is no path with the needed fields alone.
+    """Return a pattern if it is a path below the capture's folder that contains the `needed` fields.
 
-    It must stay below the capture's folder, and hold no braces but those of `fields`.
+    It may contain no braces except for `fields`. Otherwise raises InputError that names `where` it occurs.
     """
     parts = pattern.split("/")
     plain = re.sub(rf"\{{({'|'.join(fields)})\}}", "", pattern)
@@ -186,7 +180,7 @@ def require_pattern(
 
 
 def compile_pattern(pattern: str) -> re.Pattern[str]:
-    """Make a regular expression with a group per field; a repeated field must match the same text."""
+    """Return a regular expression with a group per field; a repeated field must match the same text."""
     expression = re.escape(pattern)
     for key in FIELDS:
         escaped = re.escape(f"{{{key}}}")
@@ -195,7 +189,7 @@ def compile_pattern(pattern: str) -> re.Pattern[str]:
 
 
 def find_subjects(folder: Path, pattern: str, cameras: list[str], lights: list[str]) -> Iterator[str]:
-    """Yield the subjects that have an image, sorted: the names at the part of the pattern with {subject}."""
+    """Yield the sorted names of subjects that have an image, from the part of the paths with {subject}."""
     parts = pattern.split("/")
     depth = next(index for index, part in enumerate(parts) if "{subject}" in part)
     expression = compile_pattern("/".join(parts[: depth + 1]))
@@ -206,20 +200,20 @@ def find_subjects(folder: Path, pattern: str, cameras: list[str], lights: list[s
         paths = (folder / pattern.format(subject=name, camera=c, light=i) for c in cameras for i in lights)
         if any(path.exists() for path in paths):
             if not is_name(name):
-                raise InputError(f"{folder}: the subject {name!r} is no name of letters, digits, - and _")
+                raise InputError(f"{folder}: subject {name!r}: use a name of letters, digits, - and _")
             yield name
 
 
 def unlisted_kind(name: str) -> str:
-    """Kind of an image whose name in the light's place is of no single light: 'full', 'ambient', else ''."""
+    """Return 'full' or 'ambient' for an image whose name stands for no single light, else ''."""
     plain = name.lower().strip("_- ")
-    if plain in FULL_NAMES:
+    if plain in _FULL_NAMES:
         return "full"
     return "ambient" if any(word in plain for word in _AMBIENT_WORDS) else ""
 
 
 def distorted(plane: Tensor, coefficients: Coefficients) -> Tensor:
-    """Move points of the plane at depth 1 [..., 2] (x right, y down) as the lens does.
+    """Distort points of the plane at depth 1 [..., 2] (x right, y down).
 
     OpenCV's documentation, 'Camera Calibration and 3D Reconstruction': radial and tangential distortion.
     """
@@ -232,7 +226,7 @@ def distorted(plane: Tensor, coefficients: Coefficients) -> Tensor:
 
 
 def folds(camera: PosedCamera, coefficients: Coefficients) -> bool:
-    """True where radial distortion brings points of the image nearer again: such a lens has no inverse."""
+    """Return whether the radial distortion is not monotonic within the image, so that it has no inverse."""
     k1, k2, _, _, k3 = (*coefficients, 0.0)[:5]
     corners = torch.tensor([[x, y] for x in (0.0, camera.width_px) for y in (0.0, camera.height_px)])
     r2 = (np.linspace(0, 1, _STEPS) * float(camera.to_plane(corners).norm(dim=-1).max())) ** 2
@@ -240,7 +234,7 @@ def folds(camera: PosedCamera, coefficients: Coefficients) -> bool:
 
 
 def undistorted(image: np.ndarray, camera: PosedCamera, coefficients: Coefficients) -> np.ndarray:
-    """Resample an image [H, W, 3] as the same camera sees it without distortion; the border is repeated."""
+    """Resample an image [H, W, 3] without the camera's distortion; the border is repeated."""
     view = (camera.focal_px, camera.centre_px, camera.width_px, camera.height_px)
     pixels = torch.from_numpy(image).permute(2, 0, 1)[None]
     grid = _grid(*view, coefficients)
@@ -256,7 +250,7 @@ def _grid(
     height_px: int,
     coefficients: Coefficients,
 ) -> Tensor:
-    """Place of each undistorted pixel in the distorted image [1, H, W, 2], in units of `grid_sample`."""
+    """Return each undistorted pixel's position in the distorted image [1, H, W, 2], for `grid_sample`."""
     focal, centre, size = (
         torch.tensor(pair, dtype=torch.float64) for pair in (focal_px, centre_px, (width_px, height_px))
     )

@@ -1,19 +1,19 @@
-"""Findings of a capture's checks, and the frames that go into a subject's OLAT stacks.
+"""Findings of a capture's checks, and selection of the frames for a subject's OLAT stacks.
 
-An error stops its subject, unless it is about one frame: then the subject goes on without that frame. A
-warning stops nothing.
+An error stops its subject, unless it concerns one frame: then only that frame is left out. A warning stops
+nothing.
 
-All stacks of a subject hold the same lights, because pairs share the weights of an envmap between cameras. So
-a light whose frame is missing or broken in one camera is left out for the subject; a camera that lacks most
-of its frames is left out as a whole instead, so that the other cameras keep their lights.
+All stacks of a subject contain the same lights, because pairs share the weights of an envmap between cameras.
+So a light whose frame is missing or broken in one camera is left out for the subject. A camera that lacks
+most of its frames is left out instead, so that the other cameras keep their lights.
 
-A dataset's findings.jsonl has a row for every finding; findings/SUBJECT.jsonl has those of a subject, written
-before the subject is prepared.
+A dataset's findings.jsonl has a row for every finding. findings/SUBJECT.jsonl, written before the subject is
+prepared, keeps a subject's findings for later runs.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from itertools import groupby
+from dataclasses import asdict, dataclass, field
+from itertools import chain, groupby
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,36 +31,32 @@ Severity = Literal["error", "warning"]
 LEAST_LIGHTS, LEAST_SHARE = 10, 0.5  # lights, and share of the rig's, that a usable OLAT stack has
 MISSING, MARKED = "missing", "marked as damaged"
 CONSEQUENCES = ("subject stopped", "frame left out", "warning")
-_LISTED = 6  # entries of a log line; the rest are counted
+_LISTED = 6  # entries of a log line; the others are counted
 FINDINGS_FILE, _FOLDER = "findings.jsonl", "findings"
-_SHOWN_ALIKE = 3  # findings of one check in a camera; the table counts the rest
-_STYLES = dict(zip(CONSEQUENCES, ("red", "red", "yellow"), strict=True))
-_PLAIN_WIDTH = 160  # of a log file, which has no width
+_MOST_SIMILAR = 3  # findings of one check in a camera; the table counts the others
+_PLAIN_WIDTH = 160  # columns of a table in a log file
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A fault, with a message that says what to do and the measured figures.
-
-    An empty camera or light means all of them.
-    """
+    """Fault with its remedy in words and the measured figures; no camera or light means all of them."""
 
     severity: Severity
     check: str  # name of the check, such as 'missing' or 'order'
     subject: str
     words: str
-    camera: str = ""
-    light: str = ""
+    camera: str | None = None
+    light: str | None = None
     figures: Mapping[str, float | int | str] = field(default_factory=dict)
 
     @property
     def leaves_out(self) -> bool:
-        """True if this frame alone is broken, and left out."""
+        """Whether only one frame is broken, and left out."""
         return self.severity == "error" and bool(self.light)
 
     @property
     def place(self) -> str:
-        """Place of the fault, `subject/camera/light` as far as given."""
+        """Place of the fault, `subject/camera/light` as far as known."""
         return "/".join(name for name in (self.subject, self.camera, self.light) if name)
 
     def consequence(self, strict: bool = False) -> str:
@@ -70,34 +66,18 @@ class Finding:
         return "subject stopped" if strict or self.severity == "error" else "warning"
 
     def row(self) -> dict[str, Any]:
-        """Row of findings.jsonl."""
-        return {
-            "severity": self.severity,
-            "check": self.check,
-            "subject": self.subject,
-            "camera": self.camera or None,
-            "light": self.light or None,
-            "leaves_out": self.leaves_out,
-            "words": self.words,
-            "figures": dict(self.figures),
-        }
-
-    @staticmethod
-    def of_row(row: Mapping[str, Any]) -> "Finding":
-        """Read a row of findings.jsonl."""
-        names = ("severity", "check", "subject", "words", "camera", "light")
-        known: dict[str, Any] = {name: row[name] or "" for name in names}
-        return Finding(**known, figures=row["figures"])
+        """Return the row of findings.jsonl."""
+        return {**asdict(self), "leaves_out": self.leaves_out}
 
 
 def stopping(findings: Iterable[Finding], strict: bool = False) -> list[Finding]:
     """Select the findings that stop their subject; with `strict` all do."""
-    return [found for found in findings if found.consequence(strict) == "subject stopped"]
+    return [finding for finding in findings if finding.consequence(strict) == "subject stopped"]
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Lights and cameras of a subject's stacks, and the reasons for what is left out."""
+    """Lights and cameras of a subject's stacks, with the reasons for each one that is left out."""
 
     lights: tuple[int, ...]  # indices into the capture's lights, ascending
     cameras: tuple[str, ...]
@@ -106,7 +86,7 @@ class Selection:
     missing: tuple[str, ...] = ()  # "camera/light" of the frames that do not exist
 
     def in_words(self) -> str:
-        """Log line about what is left out, except marked frames; empty where nothing is."""
+        """Return the log line about lights and cameras left out, except marked frames; empty if none is."""
         parts = []
         if lights := {light: why for light, why in self.left_out.items() if MARKED not in why}:
             parts.append(f"{counted(len(lights), 'light')} left out ({_list(lights)})")
@@ -118,9 +98,10 @@ class Selection:
 def select_frames(
     capture: Capture, subject: str, findings: Iterable[Finding] = (), strict: bool = False
 ) -> Selection:
-    """Select the frames of a subject that exist and that no finding leaves out; InputError for too few.
+    """Select the frames of a subject that exist and that no finding leaves out.
 
-    With `strict`, a missing frame that is not marked as damaged is an InputError too.
+    Raises InputError for too few frames; with `strict`, also for a missing frame that is not marked as
+    damaged.
     """
     marked = capture.marked.get(subject, frozenset())
     broken = {  # by camera, reasons by light whose frame does not exist
@@ -135,12 +116,12 @@ def select_frames(
     if strict and (unmarked := [name for name, why in missing.items() if why == MISSING]):
         first = f"{subject}/{unmarked[0]}"
         raise InputError(f"{first}: missing ({len(unmarked)} such frames); without --strict it is left out")
-    for found in findings:
-        if found.leaves_out and found.camera in broken:
-            broken[found.camera].setdefault(found.light, found.check)
+    for finding in findings:
+        if finding.camera in broken and finding.light and finding.leaves_out:
+            broken[finding.camera].setdefault(finding.light, finding.check)
     rig = len(capture.light_ids)
     dropped = {
-        camera: f"only {rig - len(lights)} of {rig} frames are there and sound"
+        camera: f"only {rig - len(lights)} of {rig} frames exist and are sound"
         for camera, lights in broken.items()
         if len(lights) > (1 - LEAST_SHARE) * rig
     }
@@ -162,20 +143,20 @@ def select_frames(
 
 
 def _list(reasons: Mapping[str, str]) -> str:
-    """The first reasons, and the number of the others."""
+    """Return the first reasons, and the number of the others."""
     words = [f"{name}: {why}" for name, why in list(reasons.items())[:_LISTED]]
     more = len(reasons) - len(words)
     return "; ".join([*words, f"and {more} more"] if more else words)
 
 
 def has_new_frames(capture: Capture, subject: str, missing: Iterable[str]) -> bool:
-    """Tell whether a frame of `Selection.missing` exists by now."""
+    """Return whether a frame of `Selection.missing` exists now."""
     frames = (name.split("/") for name in missing)
     return any(capture.frame_path(subject, camera, light).is_file() for camera, light in frames)
 
 
 def require_sound(subject: str, findings: Iterable[Finding], strict: bool) -> None:
-    """Raise InputError where findings stop the subject."""
+    """Raise InputError if findings stop the subject."""
     if at_fault := stopping(findings, strict):
         first = at_fault[0]
         more = f" ({len(at_fault)} such findings, see {FINDINGS_FILE})" if len(at_fault) > 1 else ""
@@ -185,12 +166,12 @@ def require_sound(subject: str, findings: Iterable[Finding], strict: bool) -> No
 
 def write_findings(path: Path, findings: Iterable[Finding]) -> None:
     with atomic_path(path) as temporary:
-        rows = (json_line(found.row()) + "\n" for found in findings)
+        rows = (json_line(finding.row()) + "\n" for finding in findings)
         temporary.write_text("".join(rows), encoding="utf-8")
 
 
 def keep_findings(folder: Path, subject: str, findings: Sequence[Finding]) -> None:
-    """Write a subject's findings into a dataset's folder, or remove the file where there are none."""
+    """Write a subject's findings into a dataset's folder; remove the file if there are none."""
     path = folder / _FOLDER / f"{subject}.jsonl"
     if findings:
         write_findings(path, findings)
@@ -199,20 +180,29 @@ def keep_findings(folder: Path, subject: str, findings: Sequence[Finding]) -> No
 
 
 def collect_findings(folder: Path, subjects: Iterable[str]) -> dict[str, list[Finding]]:
-    """Write findings.jsonl from all subjects' files, and return the findings by subject."""
-    found = {subject: _read_findings(folder / _FOLDER / f"{subject}.jsonl") for subject in subjects}
-    write_findings(folder / FINDINGS_FILE, (one for of_subject in found.values() for one in of_subject))
-    return {subject: of_subject for subject, of_subject in found.items() if of_subject}
+    """Write findings.jsonl from all subjects' files; return the findings by subject.
+
+    Raises InputError for a damaged file.
+    """
+    findings = {}
+    for subject in subjects:
+        path = folder / _FOLDER / f"{subject}.jsonl"
+        if not path.is_file():
+            continue
+        rows = text_of(path.read_bytes(), "replace").splitlines()
+        try:
+            findings[subject] = [_parse(row) for row in rows]
+        except (ValueError, TypeError, KeyError):
+            advice = "remove it, and pass --overwrite always to check again"
+            raise InputError(f"{path}: damaged; {advice}") from None
+    write_findings(folder / FINDINGS_FILE, chain.from_iterable(findings.values()))
+    return findings
 
 
-def _read_findings(path: Path) -> list[Finding]:
-    if not path.is_file():
-        return []
-    lines = text_of(path.read_bytes(), "replace").splitlines()
-    try:
-        return [Finding.of_row(parse_json(line)) for line in lines]
-    except (ValueError, TypeError, KeyError):
-        raise InputError(f"{path}: damaged; remove it, and give --overwrite always to check again") from None
+def _parse(row: str) -> Finding:
+    values = parse_json(row)
+    del values["leaves_out"]
+    return Finding(**values)
 
 
 def show_findings(findings: Sequence[Finding], strict: bool = False, console: Console = STDERR) -> None:
@@ -222,27 +212,26 @@ def show_findings(findings: Sequence[Finding], strict: bool = False, console: Co
     """
     if not findings:
         return
-    table = Table(title=summary(findings, strict), title_justify="left", title_style="bold", expand=False)
-    for name in ("where", "check", "what follows"):
-        table.add_column(name, no_wrap=name != "what follows", overflow="fold")
+    kinds = [finding.consequence(strict) for finding in findings]
+    counts = ", ".join(f"{kinds.count(kind)} x {kind}" for kind in CONSEQUENCES if kind in kinds)
+    subjects = counted(len({finding.subject for finding in findings}), "subject")
+    table = Table(title=f"Findings about {subjects}: {counts}", title_justify="left", title_style="bold")
+    for name in ("where", "check", "consequence"):
+        table.add_column(name, no_wrap=name != "consequence", overflow="fold")
     table.add_column("finding", overflow="fold")
 
-    def alike(found: Finding) -> tuple[int, str, str, str]:
-        return CONSEQUENCES.index(found.consequence(strict)), found.subject, found.camera, found.check
+    def key(finding: Finding) -> tuple[int, str, str, str]:
+        consequence = CONSEQUENCES.index(finding.consequence(strict))
+        return consequence, finding.subject, finding.camera or "", finding.check
 
-    for _, group in groupby(sorted(findings, key=alike), alike):
-        same = list(group)
-        for place, found in enumerate(same[:_SHOWN_ALIKE], start=1):
-            more = len(same) - _SHOWN_ALIKE if place == _SHOWN_ALIKE else 0
-            words = one_line(found.words) + (f" (and {more} more like it)" if more else "")
-            follows = found.consequence(strict)
-            table.add_row(Text(found.place), Text(found.check), Text(follows, _STYLES[follows]), Text(words))
+    for (consequence, *_), group in groupby(sorted(findings, key=key), key):
+        similar = list(group)
+        words = [one_line(finding.words) for finding in similar[:_MOST_SIMILAR]]
+        if (more := len(similar) - _MOST_SIMILAR) > 0:
+            words[-1] += f" (and {more} more like it)"
+        for finding, line in zip(similar, words, strict=False):
+            result = CONSEQUENCES[consequence]
+            styled = Text(result, "yellow" if result == "warning" else "red")
+            table.add_row(Text(finding.place), Text(finding.check), styled, Text(line))
     wide = console if console.is_terminal else Console(file=console.file, width=_PLAIN_WIDTH)
     wide.print(table)
-
-
-def summary(findings: Sequence[Finding], strict: bool = False) -> str:
-    """Title of the table: counts by consequence."""
-    kinds = [found.consequence(strict) for found in findings]
-    words = ", ".join(f"{kinds.count(kind)} x {kind}" for kind in CONSEQUENCES if kind in kinds)
-    return f"Findings about {counted(len({found.subject for found in findings}), 'subject')}: {words}"

@@ -1,8 +1,8 @@
-"""Reader of Metashape's XML: the calibrated cameras of a stage (Export Cameras).
+"""Reader for Metashape's XML: the calibrated cameras of a stage (Export Cameras).
 
-Agisoft Metashape, user manual, appendix on camera models, of frame cameras: a point (x, y) of the plane at
-depth 1, x right and y down, is moved by Brown's distortion, and seen at f x + b1 x + b2 y + cx from the
-image's middle. Its p1 and p2 are OpenCV's p2 and p1.
+Agisoft Metashape, user manual, appendix on camera models, frame cameras: Brown's distortion moves a point
+(x, y) of the plane at depth 1, x right and y down; its image lies at f x + b1 x + b2 y + cx from the image's
+centre. Its p1 and p2 are OpenCV's p2 and p1.
 """
 
 from pathlib import Path
@@ -14,16 +14,16 @@ import numpy as np
 from facerf_cli.errors import InputError
 from facerf_cli.files.texts import read_text
 
-_ADVICE = "give the XML of Metashape's Export Cameras"
-_LEAST_TERM = 1e-9  # of b2 in pixels and of k4: what the model of a capture lacks
+_ADVICE = "use the XML of Metashape's Export Cameras"
+_LEAST_TERM = 1e-9  # of b2 in pixels and of k4, which `Capture` does not support
 _TERMS = ("cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
 
 
 def read_metashape(path: Path, unit_m: float = 1.0) -> dict[str, dict[str, Any]]:
     """Read the aligned cameras of the first chunk, by label, as entries of `stage.json`'s cameras.
 
-    `unit_m` is the length of the chunk's unit in metres. Raises InputError for another file, and for lenses
-    that are not those of a frame camera.
+    `unit_m` is the length of the chunk's unit in metres. Raises InputError for other files, and for lenses
+    of other than frame cameras.
     """
     text = read_text(path, _ADVICE)
     if "<!" in text.replace("<!--", ""):
@@ -31,39 +31,31 @@ def read_metashape(path: Path, unit_m: float = 1.0) -> dict[str, dict[str, Any]]
     try:
         chunk = ElementTree.fromstring(text).find("chunk")
         if chunk is None:
-            raise ValueError("there is no chunk")
+            raise ValueError("no chunk")
         sensors = {sensor.get("id"): sensor for sensor in chunk.findall("sensors/sensor")}
-        turn, shift, scale = _chunk_to_world(chunk.find("transform"))
+        transform = {part.tag: part.text or "" for part in chunk.findall("transform/*")}
+        turn = _numbers(transform.get("rotation", "1 0 0 0 1 0 0 0 1"), 9).reshape(3, 3)
+        shift = _numbers(transform.get("translation", "0 0 0"), 3)
+        scale = _numbers(transform.get("scale", "1"), 1)
         cameras = {}
         for camera in chunk.iter("camera"):
-            if (transform := camera.findtext("transform")) is None:
-                continue  # was not aligned
-            name, to_chunk = camera.get("label", ""), _numbers(transform, 16).reshape(4, 4)
+            if (pose_text := camera.findtext("transform")) is None:
+                continue  # not aligned
+            name, to_chunk = camera.get("label", ""), _numbers(pose_text, 16).reshape(4, 4)
             rotation = (turn @ to_chunk[:3, :3]).T
             centre_m = unit_m * (scale * turn @ to_chunk[:3, 3] + shift)
             pose = np.column_stack([rotation, -rotation @ centre_m])
             lens = _lens(name, sensors[camera.get("sensor_id")])
             cameras[name] = {"id": name, **lens, "world_to_camera": pose.tolist()}
     except (ElementTree.ParseError, ValueError, TypeError, KeyError) as error:
-        raise InputError(f"{path}: is no calibration of cameras ({error}); {_ADVICE}") from None
+        raise InputError(f"{path}: not a calibration of cameras ({error}); {_ADVICE}") from None
     if not cameras:
         raise InputError(f"{path}: no camera is aligned; {_ADVICE}")
     return cameras
 
 
-def _chunk_to_world(transform: ElementTree.Element | None) -> tuple[np.ndarray, np.ndarray, float]:
-    """Rotation [3, 3], translation [3] and scale; those of a chunk that has none leave it where it is."""
-    parts = {} if transform is None else {part.tag: part.text or "" for part in transform}
-    rotation = _numbers(parts.get("rotation", "1 0 0 0 1 0 0 0 1"), 9).reshape(3, 3)
-    return (
-        rotation,
-        _numbers(parts.get("translation", "0 0 0"), 3),
-        float(_numbers(parts.get("scale", "1"), 1)[0]),
-    )
-
-
 def _lens(name: str, sensor: ElementTree.Element) -> dict[str, Any]:
-    """Size, K and distortion of a sensor, as `stage.json` has them."""
+    """Return size, K and distortion of a sensor, in the form of `stage.json`."""
     calibration = sensor.find("calibration[@class='adjusted']")
     calibration = sensor.find("calibration") if calibration is None else calibration
     if calibration is None or (calibration.get("type") or "frame") != "frame":
@@ -90,5 +82,5 @@ def _lens(name: str, sensor: ElementTree.Element) -> dict[str, Any]:
 def _numbers(text: str, count: int) -> np.ndarray:
     values = np.array(text.split(), np.float64)
     if len(values) != count or not np.isfinite(values).all():
-        raise ValueError(f"{count} finite numbers are needed, not {text[:60]!r}")
+        raise ValueError(f"use {count} finite numbers instead of {text[:60]!r}")
     return values

@@ -1,4 +1,4 @@
-"""Options to read and check a capture; light to import."""
+"""Options for reading and checking a capture; light to import."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -10,12 +10,12 @@ CAPTURE, CORRECTION = "Capture", "Checks and corrections"  # panels of the help
 
 @dataclass(frozen=True)
 class ReadSettings:
-    """Settings of reading a capture's frames.
+    """Settings for reading a capture's frames.
 
     Attributes:
-        layout: Read this layout: stage (with stage.json), extended-yale-b (cropped),
+        layout: Layout of the capture: stage (with stage.json), extended-yale-b (cropped),
             faceolat, or faceolat-linear (without colour calibration).
-        subtract_ambient: Subtract each camera's image without lights, where there is one.
+        subtract_ambient: Subtract each camera's image without lights, if there is one.
     """
 
     layout: str = option("stage", metavar="NAME", panel=CAPTURE, everyday=True)
@@ -24,13 +24,13 @@ class ReadSettings:
 
 @dataclass(frozen=True)
 class ChartSettings:
-    """A photographed colour chart by which the frames are corrected.
+    """Photographed colour chart that corrects the frames.
 
     Attributes:
-        colour_chart: Correct the colours by this image of a ColorChecker Classic under the stage's lights;
-            with {camera} in its name, by an image per camera.
-        chart_corners: Corners of the chart's 24 patches in pixels, in order around them; those of several
-            images in the order of the cameras, separated by ;.
+        colour_chart: Image of a ColorChecker Classic under the stage's lights, used to correct the colours;
+            {camera} in its name selects one image per camera.
+        chart_corners: Corners of the area of the chart's 24 patches in pixels, clockwise from the dark skin
+            patch; for several images, in the order of the cameras, separated by ;.
     """
 
     colour_chart: str = option("", metavar="IMAGE", shown_default=False, panel=CORRECTION, everyday=True)
@@ -39,11 +39,11 @@ class ChartSettings:
 
 @dataclass(frozen=True)
 class CheckSettings:
-    """Settings of the checks of frames, and of what a finding does.
+    """Settings for the checks of frames and for the effect of findings.
 
     Attributes:
-        checks: Check the frames first: broken frames are left out, errors stop a subject. only: list the
-            findings, and prepare nothing.
+        checks: Whether to check the frames first: broken frames are left out, errors stop a subject. only:
+            list the findings, and prepare nothing.
         strict: Stop a subject for any finding, missing frame or undetected face.
     """
 

@@ -1,4 +1,4 @@
-"""Reader of `stage.json`, the description of a capture that stands next to its images.
+"""Reader for `stage.json`, which describes a capture and lies next to its images.
 
     {"format": "facerf-stage-1", "axes": "opencv", "unit": "m",
      "colour_space": "lin_rec709", "black_level": 0.0,
@@ -10,21 +10,21 @@
 
 Directions are unit vectors in world space toward the light. K is in pixels whose centres lie at index + 0.5.
 world_to_camera has OpenCV's axes (y down, z forward); only this file converts it to the axes of the package
-(y up, z toward the camera). Intensities are linear Rec.709: a light of rgb 1 gives a white surface that faces
-it radiance 1. The black level is linear too.
+(y up, z toward the camera). Intensities are linear Rec.709: under a light of rgb 1, a white surface facing it
+has radiance 1. The black level is also linear.
 
-A camera may have "distortion": OpenCV's k1, k2, p1, p2 and k3, which is undone in every frame. A single
-camera without a pose is the world: x right, y up, z toward the camera.
+Reading a frame removes the camera's optional "distortion", OpenCV's k1, k2, p1, p2 and k3. A single camera
+without a pose defines the world: x right, y up, z toward the camera.
 
-A light with a position, in metres in the world, is near: its direction follows from the head that is fitted,
-and it is weighed by the square of its distance; its intensity is that at "centre" (by default the world's
-origin). "colour_matrix" [3, 3] acts on linear values without the black level, which may be of each channel.
-"exposure_stops" {subject: stops} says whose frames are brighter; "ignore" lists names in a light's place that
-are of no single light, as those of tracking frames.
+A light with a position, in metres in the world, is near: its direction depends on the fitted head, and its
+intensity, stated for "centre" (by default the world's origin), on the square of the distance. "colour_matrix"
+[3, 3] applies to linear values without the black level, which may differ between channels. "exposure_stops"
+{subject: stops} states which frames are brighter. "ignore" lists names in a light's place that belong to no
+single light, for example tracking frames.
 
 Without `subjects`, every name that the pattern finds on disk is a subject. "ambient", for example
-"{subject}/{camera}/ambient.exr", is optional: images without any light, which --subtract-ambient subtracts in
-place of the black level. A pattern may lack {camera} if there is one camera, and {subject} if `subjects`
+"{subject}/{camera}/ambient.exr", is optional: images without any light, which --subtract-ambient subtracts
+instead of the black level. A pattern may omit {camera} if there is one camera, and {subject} if `subjects`
 lists one.
 """
 
@@ -49,17 +49,16 @@ from facerf_cli.files.documents import Direction, Document, Matrix3, Name, Three
 from facerf_cli.image.colour import named_space
 from facerf_cli.raster.camera import PosedCamera
 
-StageFormat = Literal["facerf-stage-1"]
-STAGE_FORMAT: StageFormat = "facerf-stage-1"
+STAGE_FORMAT = "facerf-stage-1"
 STAGE_FILE = "stage.json"
 MOST_LIGHTS, MOST_CAMERAS, MOST_SUBJECTS = 4096, 256, 100_000
 _LONGEST_SIDE_PX = 65_536
-_ORTHONORMAL_OFF = 1e-3  # of a singular value from 1, in rotations written with few digits
+_ORTHONORMAL_OFF = 1e-3  # deviation of singular values from 1, in rotations written with few digits
 _LEAST_INTENSITY = 1e-12  # frames are divided by it, in float32
-_NEAREST_M, _MOST_STOPS = 0.05, 20.0  # of a near light from the centre; of a subject's exposure
+_NEAREST_M, _MOST_STOPS = 0.05, 20.0  # distance of a near light from the centre; a subject's exposure
 _MOST_BLACK = 1e12
-_ASPECT_OFF = 0.01  # of fx / fy from 1: a face crop has square pixels
-# A world that equals the camera's space (y up, z toward the camera), in OpenCV's axes (y down, z forward).
+_ASPECT_OFF = 0.01  # deviation of fx / fy from 1, because a face crop has square pixels
+# Pose of a camera whose space (y up, z toward the camera) is the world, in OpenCV's axes (y down, z forward).
 FACING = [[1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
 _OPENCV_TO_OURS = np.diag([1.0, -1.0, -1.0])
 
@@ -74,7 +73,7 @@ def _colour_space(name: str) -> str:
 
 def _intensity(rgb: np.ndarray) -> np.ndarray:
     if not (rgb > _LEAST_INTENSITY).all():
-        raise ValueError("a positive value in every channel is needed (frames are divided by it)")
+        raise ValueError("use a positive value in every channel (frames are divided by it)")
     return rgb
 
 
@@ -82,7 +81,7 @@ def _black_level(value: Any) -> BlackLevel:
     levels = value if isinstance(value, list) else [value]
     numbers = [level for level in levels if isinstance(level, int | float) and abs(level) <= _MOST_BLACK]
     if len(levels) not in (1, 3) or len(numbers) != len(levels) or isinstance(value, bool):
-        raise ValueError("a number, or one for each of three channels, is needed")
+        raise ValueError("use a number, or one for each of three channels")
     return (float(levels[0]), float(levels[1]), float(levels[2])) if len(levels) == 3 else float(levels[0])
 
 
@@ -92,32 +91,32 @@ def _nowhere() -> np.ndarray:
 
 def _invertible(matrix: np.ndarray) -> np.ndarray:
     if np.linalg.matrix_rank(matrix) < 3:
-        raise ValueError("a matrix that keeps three colours apart is needed")
+        raise ValueError("use an invertible matrix")
     return matrix
 
 
 def _intrinsics(k: np.ndarray) -> np.ndarray:
     fx, fy, cx, cy = k[0, 0], k[1, 1], k[0, 2], k[1, 2]
     if not (min(fx, fy) > 0 and np.allclose(k, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], atol=1e-6 * fx)):
-        raise ValueError("[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0 is needed")
+        raise ValueError("use [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0")
     if abs(fx / fy - 1) > _ASPECT_OFF:
-        raise ValueError("fx within 1 % of fy (square pixels) is needed")
+        raise ValueError("use fx within 1 % of fy (square pixels)")
     return k
 
 
 def _pose(value: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation [3, 3] nearest to the given one, and translation [3], of 3 x 4 or 4 x 4 numbers."""
+    """Parse 3 x 4 or 4 x 4 numbers; return the nearest rotation [3, 3] and the translation [3]."""
     try:
         matrix = np.array(value, np.float64)
     except (ValueError, TypeError):
         matrix = np.zeros(())
     if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
-        raise ValueError("3 x 4 finite numbers are needed")
+        raise ValueError("use 3 x 4 finite numbers")
     if len(matrix) == 4 and not np.allclose(matrix[3], [0, 0, 0, 1]):
-        raise ValueError("0 0 0 1 in the last row is needed")
+        raise ValueError("use 0 0 0 1 in the last row")
     u, stretch, vh = np.linalg.svd(matrix[:3, :3])
     if not np.abs(stretch - 1).max() < _ORTHONORMAL_OFF or np.linalg.det(u @ vh) < 0:
-        raise ValueError("a rotation without stretch or reflection, and a translation in metres, are needed")
+        raise ValueError("use a rotation without scale or reflection, and a translation in metres")
     return u @ vh, matrix[:3, 3]
 
 
@@ -127,7 +126,7 @@ def _coefficients(value: Any) -> Coefficients:
     except (ValueError, TypeError):
         numbers = ()
     if len(numbers) not in (4, 5) or not np.isfinite(numbers).all():
-        raise ValueError("k1, k2, p1, p2, k3 of OpenCV are needed; undistort images of other lenses first")
+        raise ValueError("use k1, k2, p1, p2, k3 of OpenCV; undistort images of other lenses first")
     return numbers
 
 
@@ -135,7 +134,7 @@ Side = Annotated[int, Field(ge=1, le=_LONGEST_SIDE_PX)]
 
 
 class LightEntry(Document):
-    """A light of the stage: a far one has a direction, a near one a position."""
+    """Light of the stage: a far light has a direction, a near one a position."""
 
     id: Name
     direction: Direction = Field(default_factory=_nowhere)
@@ -145,12 +144,12 @@ class LightEntry(Document):
     @model_validator(mode="after")
     def _is_somewhere(self) -> "LightEntry":
         if np.isnan(self.direction[0]) == np.isnan(self.position[0]):
-            raise ValueError("either 'direction' or 'position' is needed")
+            raise ValueError("use either 'direction' or 'position'")
         return self
 
 
 class CameraEntry(Document):
-    """A calibrated camera, with OpenCV's axes."""
+    """Calibrated camera with OpenCV's axes."""
 
     id: Name
     width: Side
@@ -166,7 +165,7 @@ class CameraEntry(Document):
         return self
 
     def posed(self) -> PosedCamera:
-        """The camera with the axes of the package."""
+        """Return the camera with the axes of the package."""
         rotation, translation_m = self.world_to_camera
         return PosedCamera(
             focal_px=(float(self.K[0, 0]), float(self.K[1, 1])),
@@ -179,7 +178,7 @@ class CameraEntry(Document):
 
 
 class StageDocument(Document):
-    format: StageFormat
+    format: Literal["facerf-stage-1"]
     axes: Literal["opencv"]
     unit: Literal["m"]
     colour_space: Annotated[str, AfterValidator(_colour_space)]
@@ -198,22 +197,22 @@ class StageDocument(Document):
     provenance: dict[str, Any] = Field(default_factory=dict)
 
     @model_validator(mode="after")
-    def _has_distinct_ids(self) -> "StageDocument":
+    def _is_consistent(self) -> "StageDocument":
         distinct([light.id for light in self.lights], "the light")
         distinct([camera.id for camera in self.cameras], "the camera")
         for light in self.lights:
             if np.linalg.norm(light.position - self.centre) < _NEAREST_M:
-                raise ValueError(f"light {light.id} is at the centre; a position in metres is needed")
+                raise ValueError(f"light {light.id} is at the centre; use a position in metres")
         if unknown := sorted(self.exposure_stops.keys() - (self.subjects or self.exposure_stops).keys()):
-            raise ValueError(f"exposure_stops: there is no subject {unknown[0]}")
-        posed = [camera.id for camera in self.cameras if "world_to_camera" in camera.model_fields_set]
-        if len(self.cameras) > 1 and (without := sorted({one.id for one in self.cameras} - set(posed))):
-            raise ValueError(f"camera {without[0]} has no 'world_to_camera'; only a single camera needs none")
+            raise ValueError(f"exposure_stops: no subject {unknown[0]}; correct the name")
+        unposed = [camera.id for camera in self.cameras if "world_to_camera" not in camera.model_fields_set]
+        if len(self.cameras) > 1 and unposed:
+            raise ValueError(f"camera {unposed[0]} has no 'world_to_camera'; only a single camera needs none")
         return self
 
 
 def read_stage(folder: Path) -> Capture:
-    """Read the capture that `stage.json` in a folder describes; InputError names the first wrong entry."""
+    """Read the capture described by a folder's `stage.json`; InputError names the first invalid entry."""
     path = folder / STAGE_FILE
     stage = read_document(path, StageDocument, "--describe drafts one from the images")
     single = {"camera": len(stage.cameras) == 1, "subject": len(stage.subjects or ()) == 1}

@@ -1,18 +1,17 @@
-"""Reader of the cropped Extended Yale Face Database B: real people under one flash at a time.
+"""Reader for the cropped Extended Yale Face Database B: real people under one flash at a time.
 
 A. Georghiades, P. Belhumeur, D. Kriegman, *From few to many: illumination cone models for face recognition
 under variable lighting and pose*, PAMI 2001; K.-C. Lee, J. Ho, D. Kriegman, *Acquiring linear subspaces for
 face recognition under variable lighting*, PAMI 2005 (the cropped form).
 
-Files are `yaleBXX/yaleBXX_P00A+035E-20.pgm`, 168 x 192 grey pixels of 8 bit, close to linear in light. A is
-the flash's azimuth in degrees, positive to the viewer's left; E is its elevation, positive above. Images that
-the database marks as damaged end in `.bad`. `yaleBXX_P00_Ambient.pgm` shows the subject without a flash; for
-some subjects it is not cropped.
+Files are `yaleBXX/yaleBXX_P00A+035E-20.pgm`, 168 x 192 grey pixels of 8 bit, nearly linear in light. A is the
+flash's azimuth in degrees, positive to the viewer's left; E is its elevation, positive above. Images that the
+database marks as damaged end in `.bad`. `yaleBXX_P00_Ambient.pgm` shows the subject without a flash; for some
+subjects it is not cropped.
 
-Nothing calibrates the camera, and the cropped images were cut out and scaled by hand, so a documented guess
-stands in: focal length `FOCAL_PX`, principal point in the middle, square pixels. The flashes' angles are
-relative to the camera's axis, so world space is camera space. All flashes have intensity 1; the unit of light
-is unknown.
+The camera is not calibrated, and the images were cropped and scaled by hand. The reader assumes a focal
+length `FOCAL_PX`, a central principal point and square pixels. The flashes' angles are relative to the
+camera's axis, so world space is camera space. All flashes have intensity 1; the unit of light is unknown.
 """
 
 import csv
@@ -32,7 +31,7 @@ from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.raster.camera import PosedCamera
 
 WIDTH_PX, HEIGHT_PX = 168, 192
-CAMERA = "P00"  # the frontal pose, the only one of the cropped database
+CAMERA = "P00"  # the frontal pose, the only one in the cropped database
 FOCAL_PX = 1000.0  # at a distance of a metre, a face then fills the image
 _LICENCE = "Extended Yale Face Database B: free for research (Georghiades et al. 2001; Lee et al. 2005)"
 _SUBJECT = re.compile(r"yaleB\d\d")
@@ -41,14 +40,14 @@ _FLASH = re.compile(r"A([+-]\d{1,3})E([+-]\d{1,2})")
 
 @dataclass(frozen=True, order=True)
 class Flash:
-    """A flash of the rig, with the angles of the file names; their azimuth has the opposite sign of ours."""
+    """Flash of the rig, with the angles in the file names; facerf's azimuth has the opposite sign."""
 
     azimuth_deg: int  # > 0: to the viewer's left
     elevation_deg: int
 
     @property
     def name(self) -> str:
-        """Name in the file names, such as `A+035E-20`."""
+        """Part of the file names, such as `A+035E-20`."""
         return f"A{self.azimuth_deg:+04d}E{self.elevation_deg:+03d}"
 
     @property
@@ -64,34 +63,27 @@ class Flash:
 
     @staticmethod
     def named(name: str) -> "Flash | None":
-        """Parse a flash's name; None for any other text."""
+        """Parse a flash's name; return None for any other text."""
         match = _FLASH.fullmatch(name)
         return Flash(int(match[1]), int(match[2])) if match else None
 
 
-def _flashes(*angles_deg: tuple[int, int]) -> frozenset[Flash]:
-    return frozenset(Flash(*angles) for angles in angles_deg)
-
-
 # Damaged without a .bad mark: two video fields under different flashes, or a flash that did not fire.
-UNMARKED_DAMAGE: Mapping[str, frozenset[Flash]] = {
-    "yaleB02": _flashes((20, -10), (25, 0), (95, 0)),
-    "yaleB05": _flashes((35, 15), (35, 40)),
-    "yaleB08": _flashes((-35, 15), (-35, 40)),
-    "yaleB09": _flashes((50, -40)),
-    "yaleB10": _flashes((50, -40)),
-    "yaleB13": _flashes((-110, -20)),
-    **{f"yaleB{number}": _flashes((95, 0)) for number in range(34, 40)},
+UNMARKED_DAMAGE: Mapping[str, Collection[Flash]] = {
+    "yaleB02": (Flash(20, -10), Flash(25, 0), Flash(95, 0)),
+    "yaleB05": (Flash(35, 15), Flash(35, 40)),
+    "yaleB08": (Flash(-35, 15), Flash(-35, 40)),
+    "yaleB09": (Flash(50, -40),),
+    "yaleB10": (Flash(50, -40),),
+    "yaleB13": (Flash(-110, -20),),
+    **{f"yaleB{number}": (Flash(95, 0),) for number in range(34, 40)},
 }
 Shifts = Mapping[tuple[str, Flash], tuple[int, int]]  # (down, right) in pixels
 
 
 @dataclass(frozen=True, eq=False)
 class YaleB:
-    """The database on disk.
-
-    `shifts` align an image with its subject's frontal one: heads drift by a pixel or so.
-    """
+    """Database on disk; `shifts` align an image with its subject's frontal one, because heads drift."""
 
     folder: Path
     files: Mapping[str, Mapping[Flash, Path]]  # by subject, sorted
@@ -105,18 +97,16 @@ class YaleB:
         return list(self.files)
 
     def flashes(self, subject: str) -> list[Flash]:
-        """Flashes of a subject, sorted by azimuth and then elevation."""
+        """Return the flashes of a subject, sorted by azimuth and then elevation."""
         return list(self.files[subject])
 
     def image(self, subject: str, flash: Flash) -> np.ndarray:
         """Read the image [192, 168] of a subject under one flash, float32 in 0..1, without a display curve.
 
-        InputError for an image that is missing, unreadable or of another size.
+        Raises InputError for an image that is missing, unreadable or has another size.
         """
         if flash not in self.files[subject]:
-            raise InputError(
-                f"{self.folder / subject}: no sound image under {flash.name}; copy the folder again"
-            )
+            raise InputError(f"{self.folder / subject}: no image under {flash.name}; copy the folder again")
         path = self.files[subject][flash]
         image = read_image(path, "linear").pixels[..., 0]
         if image.shape != (HEIGHT_PX, WIDTH_PX):
@@ -138,43 +128,46 @@ def read_yale_b(
     shifts: Shifts | None = None,
     leave_out: Mapping[str, Collection[Flash]] = UNMARKED_DAMAGE,
 ) -> YaleB:
-    """List the database's images without those of `leave_out`; nothing is decoded yet.
+    """List the database's images, except `leave_out`; nothing is decoded yet.
 
-    InputError for a folder without subjects, or a subject without images.
+    Raises InputError for a folder without subjects, or a subject without images.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; give the folder of the database")
+        raise InputError(f"{folder}: no such folder; use the folder of the database")
     subjects = sorted(
         path.name for path in folder.iterdir() if path.is_dir() and _SUBJECT.fullmatch(path.name)
     )
     if not subjects:
-        raise InputError(f"{folder}: no folders yaleB01 to yaleB39; give the folder that holds them")
+        raise InputError(f"{folder}: no folders yaleB01 to yaleB39; use the folder that contains them")
     files, marked, dropped = {}, {}, []
     for subject in subjects:
-        found, unwanted = _images_of(folder / subject, ".pgm"), leave_out.get(subject, ())
-        if not found:
+        images, damaged = _images_of(folder / subject, ".pgm"), leave_out.get(subject, ())
+        if not images:
             example = f"{subject}_{CAMERA}A+000E+00.pgm"
             raise InputError(f"{folder / subject}: no images {example} and so on; copy the folder again")
-        files[subject] = {flash: path for flash, path in found.items() if flash not in unwanted}
-        dropped += [path.stem for flash, path in found.items() if flash in unwanted]
+        files[subject] = {flash: path for flash, path in images.items() if flash not in damaged}
+        dropped += [path.stem for flash, path in images.items() if flash in damaged]
         marked[subject] = frozenset(_images_of(folder / subject, ".pgm.bad"))
     return YaleB(folder, files, marked, dropped, shifts or {})
 
 
 def _images_of(folder: Path, suffix: str) -> dict[Flash, Path]:
-    """Images of a subject in the order of their flashes."""
-    paths = folder.glob(f"{folder.name}_{CAMERA}A*{suffix}")
-    named = {path: path.name.removeprefix(f"{folder.name}_{CAMERA}").removesuffix(suffix) for path in paths}
-    found = {flash: path for path, name in named.items() if (flash := Flash.named(name))}
-    return dict(sorted(found.items()))
+    """Return the images of a subject in the order of their flashes."""
+    prefix = f"{folder.name}_{CAMERA}"
+    images = {
+        flash: path
+        for path in folder.glob(f"{prefix}A*{suffix}")
+        if (flash := Flash.named(path.name.removeprefix(prefix).removesuffix(suffix)))
+    }
+    return dict(sorted(images.items()))
 
 
 def read_shifts(path: Path) -> dict[tuple[str, Flash], tuple[int, int]]:
     """Read rows `subject,light,dy,dx`, such as yaleB01,A-130E+20,2,-1, in pixels down and right.
 
-    Other columns are ignored. InputError names the first wrong row.
+    Other columns are ignored. An InputError names the first invalid row.
     """
-    advice = "give lines subject,light,dy,dx under such a header"
+    advice = "write lines subject,light,dy,dx under such a header"
     shifts = {}
     try:
         rows = list(csv.DictReader(read_text(path, advice).splitlines()))
@@ -187,7 +180,7 @@ def read_shifts(path: Path) -> dict[tuple[str, Flash], tuple[int, int]]:
         except ValueError:
             flash = None
         if not subject or flash is None or max(abs(down), abs(right)) >= WIDTH_PX:
-            raise InputError(f"{path}: line {number} is not a shift; {advice}")
+            raise InputError(f"{path}: line {number} is invalid; {advice}")
         shifts[subject, flash] = down, right
     if not shifts:
         raise InputError(f"{path}: no shifts; {advice}")
@@ -198,7 +191,7 @@ def read_yale_capture(folder: Path) -> Capture:
     """Read the database in a folder as a capture; no images are decoded yet."""
     database = read_yale_b(folder, leave_out={})
     marked = {subject: database.marked[subject] - set(of) for subject, of in database.files.items()}
-    flashes = sorted({flash for found in (*database.files.values(), *marked.values()) for flash in found})
+    flashes = sorted(set().union(*database.files.values(), *marked.values()))
     return Capture(
         folder=folder,
         pattern="{subject}/{subject}_{camera}{light}.pgm",
@@ -207,7 +200,16 @@ def read_yale_capture(folder: Path) -> Capture:
         light_ids=tuple(flash.name for flash in flashes),
         directions_world=np.stack([flash.direction for flash in flashes]),
         intensities=np.ones((len(flashes), 3)),
-        cameras={CAMERA: guess_camera()},
+        cameras={
+            CAMERA: PosedCamera(
+                focal_px=(FOCAL_PX, FOCAL_PX),
+                centre_px=(WIDTH_PX / 2, HEIGHT_PX / 2),
+                width_px=WIDTH_PX,
+                height_px=HEIGHT_PX,
+                rotation=torch.eye(3, dtype=torch.float64),
+                translation_m=torch.zeros(3, dtype=torch.float64),
+            )
+        },
         subjects={subject: {} for subject in database.subjects},
         provenance={
             "database": "Extended Yale Face Database B, cropped",
@@ -217,18 +219,8 @@ def read_yale_capture(folder: Path) -> Capture:
         },
         ambient_pattern="{subject}/{subject}_{camera}_Ambient.pgm",
         marked={
-            subject: frozenset(flash.name for flash in found) for subject, found in marked.items() if found
+            subject: frozenset(flash.name for flash in flashes)
+            for subject, flashes in marked.items()
+            if flashes
         },
-    )
-
-
-def guess_camera() -> PosedCamera:
-    """Camera of the cropped images, at the world origin, looking down -z."""
-    return PosedCamera(
-        focal_px=(FOCAL_PX, FOCAL_PX),
-        centre_px=(WIDTH_PX / 2, HEIGHT_PX / 2),
-        width_px=WIDTH_PX,
-        height_px=HEIGHT_PX,
-        rotation=torch.eye(3, dtype=torch.float64),
-        translation_m=torch.zeros(3, dtype=torch.float64),
     )

@@ -14,7 +14,7 @@ from facerf_cli.batch.recipe import Recipe, require_same
 from facerf_cli.batch.run import Job, Outcome, run_items, sums_up
 from facerf_cli.batch.settings import BatchOptions, Settings, torch_device
 from facerf_cli.capture.capture import Capture
-from facerf_cli.capture.chart import read_charts, write_chart_overlays
+from facerf_cli.capture.chart import read_charts
 from facerf_cli.capture.checks.subject import check_subject
 from facerf_cli.capture.findings import (
     FINDINGS_FILE,
@@ -242,9 +242,6 @@ def _write_dataset(
     show_findings([finding for of_subject in findings.values() for finding in of_subject], how.strict)
     if not records:
         return
-    for older in folder.glob("colour_chart*.png"):
-        older.unlink()
-    write_chart_overlays(capture, folder)
     dataset = describe_dataset(folder, capture, records, split, seed, how.model, face_model_sha256)
     with atomic_path(folder / "index.html") as temporary:
         text = index_page(dataset, records, findings)

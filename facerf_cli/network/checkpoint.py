@@ -1,10 +1,12 @@
 """Checkpoints: safetensors files of networks, with configuration, provenance and metrics as JSON metadata.
 
-Tensors are named `<network>.<tensor>`; the metadata holds the form and the settings of each network. No
-pickle is loaded.
+Tensors are named `<network>.<tensor>`. The metadata contains the form and the settings of each network.
+Pickles are not loaded.
 """
 
 import json
+import pkgutil
+import sys
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -21,15 +23,20 @@ from facerf_cli.network.diffuse_sh import DiffuseNetwork
 from facerf_cli.network.features import AppearanceNetwork, LightNetwork
 from facerf_cli.network.files import FORMAT, read_metadata, title_of
 from facerf_cli.network.geometry import GeometryNetwork
-from facerf_cli.network.installed import installed, is_installed_name
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.portrait import PortraitNetwork
-from facerf_cli.network.reflectance import REFLECTANCE_FORMS
+from facerf_cli.network.reflectance import ReflectanceNetwork
+from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork
+from facerf_cli.network.reflectance_paper import PaperReflectanceNetwork
 from facerf_cli.run import memory
 
 _FILLS = (Tensor.uniform_, Tensor.normal_)
-_COPIES = 3  # of a file: its tensors, floats of its halves, and the networks that take them
+_COPIES = 3  # of a file in memory: its tensors, its half floats in single precision, and the networks
 
+REFLECTANCE_FORMS: dict[str, type[ReflectanceNetwork]] = {
+    "default": DefaultReflectanceNetwork,
+    "paper": PaperReflectanceNetwork,
+}
 # Classes by the name of a network in a checkpoint, and its form.
 _CLASSES: dict[tuple[str, str], type[Any]] = {
     **{("reflectance", form): network for form, network in REFLECTANCE_FORMS.items()},
@@ -43,67 +50,85 @@ _CLASSES: dict[tuple[str, str], type[Any]] = {
 }
 
 
-def use_form(form: str | None) -> None:
-    """Let checkpoints hold Reflectance Networks of a form package.module:Class that the user has installed.
+def installed_class(name: str, option: str) -> type[Any]:
+    """Import the class package.module:Class, never from the working directory.
 
-    Names of facerf's own forms change nothing. Raises UsageError where there is no such class.
+    Raises UsageError, which names the option, if no installed package contains it.
     """
-    if form and is_installed_name(form):
-        _CLASSES["reflectance", form] = installed(form, "--form")
+    path = sys.path[:]
+    sys.path[:] = [folder for folder in path if Path(folder).resolve() != Path.cwd()]
+    try:
+        kind = pkgutil.resolve_name(name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise UsageError(f"{option} {name}: {error}; install its package") from None
+    finally:
+        sys.path[:] = path
+    if not isinstance(kind, type):
+        raise UsageError(f"{option} {name}: is not a class; use package.module:Class")
+    return kind
+
+
+def use_form(form: str | None) -> None:
+    """Accept checkpoints with Reflectance Networks of the user's installed class package.module:Class.
+
+    Names of facerf's own forms have no effect. Raises UsageError if the class does not exist.
+    """
+    if form and ":" in form:
+        _CLASSES["reflectance", form] = kind = installed_class(form, "--form")
+        kind.form = form
 
 
 def form_of(name: str, form: str) -> str:
-    """The form of facerf's that a class of the user's extends, with its settings; else the form itself."""
+    """Return facerf's form that a user's class extends, with its settings; else the form itself."""
     own = _CLASSES.get((name, form))
-    if own is None or not is_installed_name(form):
+    if own is None or ":" not in form:
         return form
-    for (network, known), kind in _CLASSES.items():
-        if network == name and not is_installed_name(known) and issubclass(own, kind):
-            return known if issubclass(own.kind_of_settings, kind.kind_of_settings) else form
+    for known, kind in REFLECTANCE_FORMS.items():
+        if issubclass(own, kind) and issubclass(own.kind_of_settings, kind.kind_of_settings):
+            return known
     return form
 
 
-def _described(network: Any) -> dict[str, Any]:
-    """Form and settings of a network; a class that the user has installed does not know its name."""
-    forms = (form for (_, form), known in _CLASSES.items() if known is type(network))
-    own = next(filter(is_installed_name, forms), None)
-    if type(network) not in _CLASSES.values():
-        raise UsageError(f"{type(network).__name__}: no class of facerf's own; call use_form with its name")
-    return {**network.as_metadata(), **({"form": own} if own else {})}
-
-
 def new_network(name: str, form: str, settings: Mapping[str, Any]) -> Any:
-    """Make an untrained network of a form; settings that are missing have their defaults.
+    """Make an untrained network of a form; missing settings have their defaults.
 
-    Raises UsageError for an unknown form, TypeError or ValueError for settings that it does not have.
+    Raises UsageError for an unknown form, TypeError or ValueError for invalid settings.
     """
     forms = [known for network, known in _CLASSES if network == name]
     if form not in forms:
-        raise UsageError(f"form {form}: no such {title_of(name)}; give one of {', '.join(forms)}")
+        raise UsageError(f"form {form}: no such {title_of(name)}; use one of {', '.join(forms)}")
     return _CLASSES[name, form].from_metadata({"form": form, **settings})
 
 
-def save_networks(path: Path, networks: Mapping[str, nn.Module], metadata: dict[str, Any]) -> None:
-    """Write networks by name, with their form and settings and further metadata."""
-    tensors = {f"{name}.{key}": t for name, net in networks.items() for key, t in net.state_dict().items()}
-    described = {name: _described(network) for name, network in networks.items()}
+def save_networks(path: Path, networks: Mapping[str, Any], metadata: dict[str, Any]) -> None:
+    """Write networks by name, with their form and settings and other metadata.
+
+    Raises UsageError for a user's class that `use_form` has not registered.
+    """
+    tensors: dict[str, Tensor] = {}
+    described: dict[str, Any] = {}
+    for name, network in networks.items():
+        if type(network) not in _CLASSES.values():
+            raise UsageError(f"{type(network).__name__}: unknown network; call use_form with its name")
+        tensors |= {f"{name}.{key}": tensor for key, tensor in network.state_dict().items()}
+        described[name] = network.as_metadata()
     save_checkpoint(path, tensors, {"networks": described, **metadata}, half=False)
 
 
 def load_networks(
     path: Path, layout_version: int, names: Collection[str] | None = None
 ) -> tuple[dict[str, nn.Module], dict[str, Any]]:
-    """Read the networks of a checkpoint, or those of some names, on the CPU, and its metadata.
+    """Read the networks of a checkpoint, or only the `names`, on the CPU, and its metadata.
 
-    Raises InputError if it is not a checkpoint of this UV layout and of this version's networks, or of one
-    of the user's own that `use_form` does not know. Nothing is imported because a file names it.
+    Raises InputError unless it is a checkpoint of this UV layout and of this version's networks, or of a form
+    registered by `use_form`. No code that a file names is imported.
     """
     tensors, metadata = load_checkpoint(path)
     if metadata.get("layout_version") != layout_version:
         raise InputError(f"{path}: trained for another UV layout; train it again with this version of facerf")
     try:
         networks = {
-            name: _restore(name, described, _tensors_of(tensors, name))
+            name: _restore(name, described, tensors)
             for name, described in metadata["networks"].items()
             if names is None or name in names
         }
@@ -117,7 +142,7 @@ def load_networks(
 def save_checkpoint(
     path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any], half: bool = True
 ) -> None:
-    """Write tensors (with `half` floats in half precision) and metadata, whole or not at all."""
+    """Write tensors (with `half`, floats in half precision) and metadata atomically."""
     stored = {
         k: (t.half() if half and t.is_floating_point() else t).contiguous().cpu() for k, t in tensors.items()
     }
@@ -134,37 +159,30 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
         tensors = {k: (t.float() if t.dtype == torch.float16 else t) for k, t in tensors.items()}
         if not all(tensor.sum().isfinite() for tensor in tensors.values()):
-            raise ValueError("it holds values that are not finite")
+            raise ValueError("some values are not finite")
     except (SafetensorError, OSError, ValueError, RuntimeError) as error:
         raise InputError(
-            f"{path}: not a facerf checkpoint ({error}); give a file that `facerf train` wrote"
+            f"{path}: not a facerf checkpoint ({error}); use a file that `facerf train` wrote"
         ) from None
     return tensors, metadata
 
 
 def _restore(name: str, described: dict[str, Any], tensors: dict[str, Tensor]) -> nn.Module:
-    """Make the network that metadata describe and load its tensors; raises ValueError if they do not fit."""
+    """Make the network described by metadata and load its tensors; raises RuntimeError if they do not fit."""
     form = described["form"]
-    if (name, form) not in _CLASSES and is_installed_name(form):
-        raise UsageError(f"its network is {form}, code of your own; give --form {form}")
-    network_class = _CLASSES[name, form]
-    with torch.device("meta"), _Unfilled():  # takes no memory, whatever sizes the file demands
-        shapes = network_class.from_metadata(described).state_dict().items()
-        expected = {key: tensor.shape for key, tensor in shapes}
-    if expected != {key: tensor.shape for key, tensor in tensors.items()}:
-        raise ValueError(f"{name}: the sizes of its tensors are not those of its settings")
-    with _Unfilled():
-        network: nn.Module = network_class.from_metadata(described)
-    network.load_state_dict(tensors)
-    # processors convolve faster so, and graphics cards no slower
+    if (name, form) not in _CLASSES and ":" in form:
+        raise UsageError(f"its network is the custom class {form}; use --form {form}")
+    with _WithoutInitialValues():
+        network: nn.Module = _CLASSES[name, form].from_metadata(described)
+    prefix = f"{name}."
+    own = {key.removeprefix(prefix): tensor for key, tensor in tensors.items() if key.startswith(prefix)}
+    network.load_state_dict(own)
+    # processors convolve faster in this format, and GPUs equally fast
     return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
 
-class _Unfilled(TorchFunctionMode):
-    """Leaves out the first values of weights, which those of a checkpoint replace.
-
-    On the device meta, drawing them would import most of torch's compiler.
-    """
+class _WithoutInitialValues(TorchFunctionMode):
+    """Skip the random initial weights, which take seconds and which a checkpoint replaces."""
 
     def __torch_function__(
         self, function: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
@@ -176,15 +194,10 @@ class _Unfilled(TorchFunctionMode):
         return function(*args, **kwargs)
 
 
-def _tensors_of(tensors: dict[str, Tensor], name: str) -> dict[str, Tensor]:
-    prefix = f"{name}."
-    return {key.removeprefix(prefix): t for key, t in tensors.items() if key.startswith(prefix)}
-
-
 def read_tensors(path: Path, advice: str) -> Mapping[str, Any]:
-    """Read the tensors of a .pth or .safetensors by name; raise ValueError where it is neither.
+    """Read the tensors of a .pth or .safetensors by name.
 
-    A missing file raises InputError, which ends with `advice`.
+    Raises InputError with `advice` if the file is missing, ValueError for another format.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file; {advice}")
@@ -192,8 +205,8 @@ def read_tensors(path: Path, advice: str) -> Mapping[str, Any]:
         if path.suffix == ".safetensors":
             return load_file(path)
         tensors = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # whatever a broken or hostile file makes its reader raise
+    except Exception as error:  # a broken or hostile file may raise any exception
         raise ValueError(f"cannot be read as tensors ({type(error).__name__})") from None
     if not isinstance(tensors, Mapping):
-        raise ValueError("it holds no tensors by name")
+        raise ValueError("it contains no tensors by name")
     return tensors

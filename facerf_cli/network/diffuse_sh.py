@@ -1,9 +1,9 @@
-"""The network of the diffuse baseline: it regresses albedo and a smooth light from the texture of a face.
+"""Network of the diffuse baseline: it regresses albedo and a smooth light from the texture of a face.
 
-The assumption is that of Tewari et al., *MoFA: model-based deep convolutional face autoencoder for
-unsupervised monocular reconstruction*, ICCV 2017, with which the paper compares ('Results'): Lambert's law
-and spherical harmonics of order 2, both regressed by a network. The rest is this project's: the network works
-in UV space with the fitted normals, and its albedo is a texture, where theirs is a vector of a linear model.
+The paper compares with Tewari et al., *MoFA: model-based deep convolutional face autoencoder for unsupervised
+monocular reconstruction*, ICCV 2017 ('Results'). They assume Lambert's law and spherical harmonics of order
+2, both regressed by a network, and so does this one. It differs in that it works in UV space with the fitted
+normals, and that its albedo is a texture instead of a linear model's coefficients.
 """
 
 import math
@@ -30,11 +30,11 @@ from facerf_cli.network.inputs import (
 
 ORDER = 2
 COEFFICIENTS = (ORDER + 1) ** 2
-_DARKEST = 1e-8  # radiance at which the slope of the square root is still finite
-_LOGIT_MARGIN = 0.01  # distance from black and white at which a radiance is clamped for its logit
+_DARKEST = 1e-8  # least radiance, to keep the slope of the square root finite
+_LOGIT_MARGIN = 0.01  # least distance of a radiance from black and white, for its logit
 _GAIN = 0.5  # gain of the albedo's logit in an untrained network
 _MAP_SIDE = 64  # of the stored normals of the mean face
-_ROTATION_DIRECTIONS = 36  # at which a light is evaluated to rotate it: four per coefficient
+_ROTATION_DIRECTIONS = 36  # samples of a light, used to rotate it: four per coefficient
 _CONSTANT = math.sqrt(4 * math.pi)  # the coefficient of a constant envmap of radiance 1
 
 
@@ -55,7 +55,7 @@ class DiffuseEstimate(NamedTuple):
 
     albedo: Tensor  # [B, 3, T, T] in 0..1, with a mean near `MEAN_RADIANCE`
     coefficients: Tensor  # [B, 9, 3] in camera space, see light.sh.CONVENTION
-    exposure: Tensor  # [B, 1, 1, 1] what the texture was divided by, see `exposure_of`
+    exposure: Tensor  # [B, 1, 1, 1] divisor of the texture, see `exposure_of`
 
 
 class DiffuseNetwork(SavedNetwork):
@@ -91,7 +91,7 @@ class DiffuseNetwork(SavedNetwork):
         self.register_buffer("coefficients_of", inverse, persistent=False)
 
     def set_mean_face(self, normals: Tensor) -> None:
-        """Store the normals [3, T, T] of the mean face, head frame, from which a head's pose is estimated."""
+        """Store the mean face's normals [3, T, T], head frame, used to estimate a head's pose."""
         size = (_MAP_SIDE, _MAP_SIDE)
         self.mean_normals.copy_(F.normalize(F.interpolate(normals[None], size, mode="area")[0], dim=0))
 
@@ -107,13 +107,13 @@ class DiffuseNetwork(SavedNetwork):
         light = self.light(x).float().unflatten(1, (COEFFICIENTS, 3))
         for up, skip in zip(reversed(self.up), reversed(features), strict=True):
             x = up(x, skip)
-        # The layer's output is a difference from a constant envmap, under which a face shows its albedo.
+        # The layer predicts the difference from a constant envmap, which makes a face show its albedo.
         ambient = _CONSTANT * F.one_hot(torch.zeros((), dtype=torch.long), COEFFICIENTS).to(light)
         light = self._to_camera(light + ambient[:, None], normals)
         return DiffuseEstimate(self._albedo(x, texture / exposure), light, exposure)
 
     def _albedo(self, features: Tensor, radiance: Tensor) -> Tensor:
-        """Albedo at the side of the texture from its radiance [B, 3, T, T] over the exposure.
+        """Return the albedo at the texture's side from its radiance [B, 3, T, T] over the exposure.
 
         The network predicts a gain and a bias of the radiance's logit, which is about its logarithm except
         near 1: a gain of 1 divides by a shading, a gain of 0 replaces what is clipped or dark.
@@ -124,7 +124,7 @@ class DiffuseNetwork(SavedNetwork):
         return torch.sigmoid(mean + (_GAIN + gain) * difference + bias)
 
     def _to_camera(self, coefficients: Tensor, normals: Tensor) -> Tensor:
-        """Rotate lights [B, 9, 3] from the head frame, in which UV space is fixed, to camera space."""
+        """Rotate lights [B, 9, 3] from the head frame, where UV space is fixed, to camera space."""
         head_to_camera = head_rotation(self.mean_normals, normals).float()
         came_from = (self.directions[None, :, :, None] * head_to_camera[:, None]).sum(2)  # row by row: R^T d
         turn = (self.coefficients_of[None, :, :, None] * sh_basis(came_from, ORDER)[:, None]).sum(2)
@@ -132,10 +132,9 @@ class DiffuseNetwork(SavedNetwork):
 
 
 def shading(normals: Tensor, coefficients: Tensor) -> Tensor:
-    """Radiance [B, M, 3, T, T] of a white diffuse face in M lights: irradiance over pi, at least 0.
+    """Return the radiance [B, M, 3, T, T] of a white diffuse face: irradiance over pi, at least 0.
 
-    normals [B, 3, T, T] and coefficients [B, M, 9, 3] are in the same space. No part of the face shadows
-    another: that is the assumption.
+    normals [B, 3, T, T] and coefficients [B, M, 9, 3] are in the same space. Cast shadows are ignored.
     """
     faces = []
     for normal, lights in zip(normals, coefficients, strict=True):

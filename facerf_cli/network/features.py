@@ -1,10 +1,10 @@
-"""Networks whose features compare images and textures: V_f, S_f and LPIPS, all on the trunk of VGG-16.
+"""Networks whose features compare images and textures: V_f, S_f and LPIPS, all with the trunk of VGG-16.
 
 V_f (paper, 'Loss Functions') is the trunk of VGG-16 (Simonyan and Zisserman, *Very deep convolutional
 networks for large-scale image recognition*, 2015, configuration D) with ImageNet's weights; it is never
-trained here. S_f is the same trunk, narrower if the settings say so, under a head that regresses the
-direction of the light on a texture; it is trained (`training/light_features.py`), then frozen like
-V_f. LPIPS version 0.1 is the form 'lin' on VGG (Zhang et al., *The Unreasonable Effectiveness of Deep
+trained here. S_f is the same trunk, possibly narrower, with a head that regresses the direction of the light
+on a texture; it is trained (`training/light_features.py`), then frozen like V_f. LPIPS version 0.1 is the
+form 'lin' on VGG (Zhang et al., *The Unreasonable Effectiveness of Deep
 Features as a Perceptual Metric*, CVPR 2018).
 
 All of them read scene-linear Rec.709 at the caller's exposure, with white at 1; values above 1 are kept. They
@@ -31,28 +31,28 @@ CONVOLUTIONS = (
 _POOLS = (4, 9, 16, 23)  # indices of the pooling layers
 FEATURE_LAYERS = {"conv1_2": 3, "conv2_2": 8, "conv3_3": 15}  # index of the ReLU of each layer of V_f and S_f
 LPIPS_LAYERS = FEATURE_LAYERS | {"conv4_3": 22, "conv5_3": 29}  # and of LPIPS
-IMAGENET_MEAN = (0.485, 0.456, 0.406)  # of encoded RGB in 0..1, with which torchvision's weights were trained
+IMAGENET_MEAN = (0.485, 0.456, 0.406)  # of encoded RGB in 0..1, used to train torchvision's weights
 IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
-SMALLEST_PX = 16  # side of an image of LPIPS: below it the last layers have no pixels
-_EPSILON = 1e-10  # added to lengths of features, as in the published code of LPIPS
+SMALLEST_PX = 16  # least side of images for LPIPS, so that the last layers have pixels
+_EPSILON = 1e-10  # added to lengths of features, like in the published code of LPIPS
 
 
 class FeatureNetwork(Protocol):
     """V_f or S_f."""
 
     def layers(self, linear: Tensor) -> list[Tensor]:
-        """Features of linear images [B, 3, H, W] after the ReLU of each of `FEATURE_LAYERS`."""
+        """Return features of linear images [B, 3, H, W] after the ReLU of each of `FEATURE_LAYERS`."""
 
 
 def feature_distance(
     net: FeatureNetwork, prediction: Tensor, target: Tensor, powers: Tensor | None = None
 ) -> Tensor:
-    """Squared distance of features, summed over the layers [B]; prediction and target [B, 3, H, W] linear.
+    """Return the squared distance [B] of features, summed over the layers; images [B, 3, H, W] are linear.
 
-    It is one term of the paper's L_I (with V_f) or L_L (with S_f). The paper leaves open if a layer's squared
-    norm is a sum or a mean: here it is the mean over the layer's elements, so that a weight means the same at
-    every size; over `powers` [layers], if given (`layer_powers`). No gradient flows to `target`. Mask both
-    images first, with the same mask.
+    It is one term of the paper's L_I (with V_f) or L_L (with S_f). The paper does not specify whether a
+    layer's squared norm is a sum or a mean. Here it is the mean over the layer's elements, so that weights do
+    not depend on the size, divided by `powers` [layers] (see `layer_powers`) unless they are None. No
+    gradient flows to `target`. Mask both images first, with the same mask.
     """
     with torch.no_grad():
         wanted = net.layers(target)
@@ -63,9 +63,9 @@ def feature_distance(
 
 @torch.no_grad()
 def layer_powers(net: FeatureNetwork, images: Tensor) -> Tensor:
-    """Mean squares [layers] of a network's features on linear images [B, 3, H, W].
+    """Return mean squares [layers] of a network's features on linear images [B, 3, H, W].
 
-    Distances relative to them weigh every layer and every network alike, whatever the size of its features.
+    Distances relative to them give every layer and every network the same weight.
     """
     return torch.stack([layer.float().square().mean() for layer in net.layers(images)])
 
@@ -77,7 +77,7 @@ class VggFeatures(nn.Module):
     deviation: Tensor
 
     def __init__(self, width: float = 1.0, wanted: Mapping[str, int] = FEATURE_LAYERS) -> None:
-        """Make the trunk up to the last of the `wanted` layers; `width`, up to 4, scales all channels."""
+        """Make the trunk up to the last `wanted` layer; `width`, up to 4, scales all channels."""
         super().__init__()
         if not 0 < width <= 4:
             raise ValueError(f"a width of {width}")
@@ -101,19 +101,19 @@ class VggFeatures(nn.Module):
         return list(self._wanted.values())
 
     def layers(self, linear: Tensor) -> list[Tensor]:
-        """Features [B, C, H / s, W / s], s = 1, 2, 4 .., of the wanted layers for images [B, 3, H, W]."""
+        """Return features [B, C, H / s, W / s], s = 1, 2, 4 .., of the wanted layers, of [B, 3, H, W]."""
         x = (encode_display(linear.float()) - self.mean) / self.deviation
-        found = []
+        features = []
         for index, module in enumerate(self.features):
             x = module(x)
             if index in self._wanted:
-                found.append(x)
-        return found
+                features.append(x)
+        return features
 
     def load_published(self, tensors: Mapping[str, Tensor]) -> None:
-        """Load the trunk from the weights of a VGG-16 by torchvision's names, ignoring other layers.
+        """Load the trunk from a VGG-16's weights with torchvision's names, ignoring other layers.
 
-        Raises ValueError that names a layer which is missing or does not fit.
+        Raises ValueError that names a missing or unsuitable layer.
         """
         own = self.state_dict().items()
         self.load_state_dict({name: _fitting(tensors, name, tensor) for name, tensor in own})
@@ -137,36 +137,33 @@ def _convolution(channels_in: int, channels_out: int) -> nn.Conv2d:
 
 
 def _fitting(tensors: Mapping[str, Tensor], name: str, like: Tensor) -> Tensor:
-    """A published tensor with the shape of another; ValueError where it is missing or does not fit."""
-    given = tensors.get(name)
-    if not isinstance(given, Tensor):
+    """Return a published tensor; raises ValueError unless it is finite and has the shape of another."""
+    tensor = tensors.get(name)
+    if not isinstance(tensor, Tensor):
         raise ValueError(f"it has no {name}")
-    if given.shape != like.shape or not given.is_floating_point():
-        raise ValueError(f"its {name} is {_shape_and_type(given)}, not {_shape_and_type(like)}")
-    if not given.isfinite().all():
-        raise ValueError(f"its {name} holds values that are not finite")
-    return given
-
-
-def _shape_and_type(tensor: Tensor) -> str:
-    return f"{' x '.join(map(str, tensor.shape))} {str(tensor.dtype).removeprefix('torch.')}"
+    if tensor.shape != like.shape or not tensor.is_floating_point():
+        kind, needed = (f"{' x '.join(map(str, t.shape))} {t.dtype}" for t in (tensor, like))
+        raise ValueError(f"its {name} is {kind}, not {needed}")
+    if not tensor.isfinite().all():
+        raise ValueError(f"its {name} contains values that are not finite")
+    return tensor
 
 
 @dataclass(frozen=True)
 class LightSettings:
     """Sizes of S_f; the default is fast on a CPU, `width` 1 is the trunk of VGG-16.
 
-    `side` is that of the textures it was trained on, the only one at which its features are right.
+    `side` is the side of the training textures; features are correct only at this side.
     """
 
     width: VggWidth = 0.25
-    grid: Grid = 8  # side to which conv3_3 is pooled before the head: the places that are lit show the light
+    grid: Grid = 8  # side of the pooled conv3_3 before the head: bright places reveal the light
     hidden: Count = 128
     side: Side = 128
 
 
 class TrainedFeatures(SavedNetwork):
-    """The trunk of VGG-16 under a head of `outputs` numbers; the features of the trunk compare images."""
+    """Trunk of VGG-16 with a head of `outputs` numbers; the features of the trunk compare images."""
 
     form = "vgg"
 
@@ -182,19 +179,19 @@ class TrainedFeatures(SavedNetwork):
         )
 
     def regressed(self, images: Tensor) -> Tensor:
-        """Outputs of the head [B, outputs] for linear images [B, 3, H, W]."""
+        """Return the head's outputs [B, outputs] for linear images [B, 3, H, W]."""
         outputs: Tensor = self.head(self.pool(self.layers(images)[-1]).flatten(1)).float()
         return outputs
 
     def layers(self, linear: Tensor) -> list[Tensor]:
-        """Features of the trunk at its own side; see `VggFeatures.layers`."""
+        """Return features of the trunk at its side; see `VggFeatures.layers`."""
         return self.trunk.layers(resize(linear, self.settings.side))
 
 
 class LightNetwork(TrainedFeatures):
-    """S_f: regress the direction of the one light on a texture, in the head frame.
+    """S_f: regress the direction of the single light on a texture.
 
-    The head frame, since a texture does not show the head's pose.
+    The direction is in the head frame, because a texture does not show the head's pose.
     """
 
     kind_of_settings = LightSettings
@@ -203,7 +200,7 @@ class LightNetwork(TrainedFeatures):
         super().__init__(settings, 3)
 
     def forward(self, textures: Tensor) -> Tensor:
-        """Unit directions [B, 3] toward the light of linear textures [B, 3, T, T], zero where hidden."""
+        """Return unit directions [B, 3] toward the light for linear textures [B, 3, T, T], 0 where hidden."""
         return F.normalize(self.regressed(textures), dim=-1)
 
 
@@ -211,13 +208,13 @@ class Lpips(nn.Module):
     """Perceptual distance of images; its tensors are `trunk.features.N` (VGG-16) and `heads.N` [C]."""
 
     def __init__(self, width: float = 1.0) -> None:
-        """Make an untrained network; `width` scales the channels, for tests: 1 is what is published."""
+        """Make an untrained network; `width` scales the channels, for tests: 1 is the published one."""
         super().__init__()
         self.trunk = VggFeatures(width, LPIPS_LAYERS)
         self.heads = nn.ParameterList([torch.ones(count) / count for count in self.trunk.layer_channels()])
 
     def forward(self, first: Tensor, second: Tensor) -> Tensor:
-        """LPIPS [B] of scene-linear images [B, 3, H, W] of 16 px a side or more, which are encoded here."""
+        """Return LPIPS [B] of scene-linear images [B, 3, H, W] with sides of at least 16 px."""
         if min(first.shape[-2:]) < SMALLEST_PX or first.shape != second.shape:
             raise ValueError(f"images {tuple(first.shape)} and {tuple(second.shape)}")
         total = first.new_zeros(len(first))
@@ -230,16 +227,16 @@ class Lpips(nn.Module):
     def load_heads(self, tensors: Mapping[str, Tensor]) -> None:
         """Load the heads by their published names, `linN.model.1.weight` [1, C, 1, 1].
 
-        Raises ValueError that names a head which is missing or does not fit.
+        Raises ValueError that names a missing or unsuitable head.
         """
-        found = []
+        loaded = []
         for index, head in enumerate(self.heads):
             name = f"lin{index}.model.1.weight"
-            found.append(_fitting(tensors, name, head.view(1, -1, 1, 1)))
-            if (found[-1] < 0).any():
-                raise ValueError(f"its {name} holds values below 0")
+            loaded.append(_fitting(tensors, name, head.view(1, -1, 1, 1)))
+            if (loaded[-1] < 0).any():
+                raise ValueError(f"its {name} contains values below 0")
         with torch.no_grad():
-            for head, values in zip(self.heads, found, strict=True):
+            for head, values in zip(self.heads, loaded, strict=True):
                 head.copy_(values.flatten())
 
 
@@ -260,7 +257,7 @@ class AppearanceSettings:
 
 
 class AppearanceNetwork(TrainedFeatures):
-    """Tell who is shown in an image, and where its light comes from."""
+    """Classify the person in an image, and regress the direction of its light."""
 
     kind_of_settings = AppearanceSettings
 
@@ -268,6 +265,6 @@ class AppearanceNetwork(TrainedFeatures):
         super().__init__(settings, settings.people + 3)
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Scores of the people [B, P] and unit directions toward the light [B, 3], camera space."""
-        found = self.regressed(images)
-        return found[:, :-3], F.normalize(found[:, -3:], dim=-1)
+        """Return scores of the people [B, P] and unit directions toward the light [B, 3], camera space."""
+        outputs = self.regressed(images)
+        return outputs[:, :-3], F.normalize(outputs[:, -3:], dim=-1)

@@ -1,9 +1,9 @@
-"""Which checkpoint serves each network: a user's files, and behind them the ones that ship.
+"""Choice of a checkpoint for each network: the user's files, else the shipped ones.
 
-Only the headers of checkpoints are read, so that nothing heavy is imported.
+Only headers of checkpoints are read, so that nothing heavy is imported.
 """
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from facerf_cli.files.texts import parse_json
 FORMAT = "facerf-checkpoint-1"
 BEST = "best.safetensors"  # in a run's folder
 _ASSETS = Path(__file__).parents[1] / "assets"
-# The shipped file of each network that verbs use.
+# Shipped file of each network.
 SHIPPED = {
     "reflectance": _ASSETS / "default.safetensors",
     "geometry": _ASSETS / "default.safetensors",
@@ -34,8 +34,8 @@ _TITLES = {
 
 
 @dataclass(frozen=True)
-class _Held:
-    """Names of the networks of a checkpoint: all, and those that its last training trained."""
+class _Networks:
+    """Names of a checkpoint's networks: all, and the ones trained last."""
 
     path: Path
     networks: tuple[str, ...]
@@ -43,7 +43,7 @@ class _Held:
 
 
 def checkpoint_file(path: Path) -> Path:
-    """The checkpoint that `--checkpoint` names: a file, or the best one of a run's folder."""
+    """Return the file for a value of `--checkpoint`: a file, or the best checkpoint of a run's folder."""
     return path / BEST if path.is_dir() else path
 
 
@@ -55,7 +55,7 @@ def read_metadata(path: Path) -> dict[str, Any]:
         where = (
             f"{path.parent}: no {BEST} in this folder" if path.name == BEST else f"{path}: no such checkpoint"
         )
-        raise InputError(f"{where}; give a .safetensors file that `facerf train` wrote, or a run's folder")
+        raise InputError(f"{where}; use a .safetensors file that `facerf train` wrote, or a run's folder")
     try:
         with safe_open(path, framework="np") as file:
             header = file.metadata() or {}
@@ -65,7 +65,7 @@ def read_metadata(path: Path) -> dict[str, Any]:
     except (SafetensorError, OSError, KeyError, ValueError, RecursionError, RuntimeError) as error:
         reason = "the file is empty" if not path.stat().st_size else error
         raise InputError(
-            f"{path}: not a facerf checkpoint ({reason}); give a file that `facerf train` wrote"
+            f"{path}: not a facerf checkpoint ({reason}); use a file that `facerf train` wrote"
         ) from None
     if header.get("format") != FORMAT:
         raise InputError(f"{path}: written by another version of facerf; train or fetch the checkpoint again")
@@ -73,57 +73,53 @@ def read_metadata(path: Path) -> dict[str, Any]:
 
 
 def serving_files(given: Sequence[Path], uses: Collection[str] = SHIPPED, user: str = "") -> dict[str, Path]:
-    """Return the file that serves each network.
+    """Return the file of each network.
 
-    A file counts for the networks that its last training trained. The copies that it carries count where no
-    other file gives them; what no file gives comes from the shipped ones.
+    A file provides the networks that its last training trained. Its other networks are used if no other file
+    provides them. All others are the shipped ones.
 
     Args:
-        given: the user's checkpoints.
-        uses: names of the networks that are needed.
-        user: who needs them, for the error of a file that serves none of them.
+        given: The user's checkpoints.
+        uses: Names of the required networks.
+        user: Name of the command, for the error about an unused file.
 
-    Raises InputError where two files trained the same network, or a file serves no network.
+    Raises UsageError if two files trained the same network, or a file is not used.
     """
-    held = [_held_by(path) for path in given]
-    found = dict(SHIPPED)
-    for one in reversed(held):
-        found.update(dict.fromkeys(one.networks, one.path))
+    checkpoints = [_read_names(path) for path in given]
+    files = dict(SHIPPED)
+    for checkpoint in reversed(checkpoints):
+        files.update(dict.fromkeys(checkpoint.networks, checkpoint.path))
     trained: dict[str, Path] = {}
-    for one in held:
-        for name in one.trained:
+    for checkpoint in checkpoints:
+        for name in checkpoint.trained:
             if name in trained:
-                raise UsageError(
-                    f"--checkpoint {one.path}: holds a {title_of(name)}, as does {trained[name]}; "
-                    "give one of them"
-                )
-            trained[name] = one.path
-    found |= trained
-    serving = {name: found[name] for name in SHIPPED if name in uses}
-    for one in held:
-        if one.path not in serving.values():
-            has = " and ".join(map(title_of, one.trained or one.networks)) or "no network"
-            needs = f"{user} uses the {_listed(serving)}" if serving else f"{user} uses no network"
-            raise UsageError(f"--checkpoint {one.path}: holds a {has}, but {needs}; leave it out")
+                both = f"contains a {title_of(name)}, but so does {trained[name]}"
+                raise UsageError(f"--checkpoint {checkpoint.path}: {both}; use one of them")
+            trained[name] = checkpoint.path
+    files |= trained
+    serving = {name: files[name] for name in SHIPPED if name in uses}
+    for checkpoint in checkpoints:
+        if checkpoint.path not in serving.values():
+            has = " and ".join(map(title_of, checkpoint.trained)) or "no network"
+            *before, last = map(title_of, serving) if serving else ["no network"]
+            needs = f"{', '.join(before)} and {last}" if before else last
+            raise UsageError(
+                f"--checkpoint {checkpoint.path}: contains {has}; {user} uses {needs}; remove it"
+            )
     return serving
 
 
-def _held_by(path: Path) -> _Held:
+def _read_names(path: Path) -> _Networks:
     metadata = read_metadata(path)
     try:
         networks = tuple(map(str, metadata["networks"]))
         last = metadata["training"][-1] if metadata.get("training") else {}
         trained = tuple(name for name in last.get("networks", networks) if name in networks)
     except (LookupError, TypeError, AttributeError):
-        raise InputError(f"{path}: does not say what networks it holds; train it again") from None
-    return _Held(path, networks, trained or networks)
+        raise InputError(f"{path}: does not name its networks; train it again") from None
+    return _Networks(path, networks, trained or networks)
 
 
 def title_of(name: str) -> str:
-    """Name of a network in messages."""
+    """Return the name of a network in messages."""
     return _TITLES.get(name, f"network {name}")
-
-
-def _listed(names: Iterable[str]) -> str:
-    *before, last = map(title_of, names)
-    return f"{', '.join(before)} and {last}" if before else last

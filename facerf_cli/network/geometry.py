@@ -1,9 +1,9 @@
-"""The Geometry Network: from the crop of a face to pose, identity and expression.
+"""Geometry Network: from the crop of a face to pose, identity and expression.
 
 See paper, 'Network Architecture'. It has two forms. `paper` is the trunk of AlexNet (Krizhevsky et al.,
 *ImageNet classification with deep convolutional neural networks*, 2012) with the layer sizes of its one-tower
 form (Krizhevsky, *One weird trick for parallelizing convolutional neural networks*, 2014), without dropout,
-since a regression does not need it. `default` is a small residual trunk on a smaller crop. Rotations leave
+which a regression does not need. `default` is a small residual trunk on a smaller crop. Rotations leave
 the network as two columns that are then orthonormalised (Zhou et al., *On the continuity of rotation
 representations in neural networks*, 2019).
 """
@@ -20,11 +20,11 @@ from torch import Tensor, nn
 from facerf_cli.network.inputs import Down, SavedNetwork, resize
 
 GeometryForm = Literal["default", "paper"]
-_SIDES: dict[str, int] = {"default": 64, "paper": 224}  # of the crop that each form reads
+_SIDES: dict[str, int] = {"default": 64, "paper": 224}  # of each form's crop
 Coefficients = Annotated[int, Field(ge=0, le=500)]
-_SHIFT, _DEPTH = 0.05, 0.2  # what one unit of an output shifts the head: a share of the depth, of log depth
-_ALPHA, _BETA = 0.3, 0.7  # and the coefficients, in standard deviations; as wide as the priors of the fit
-_BRIGHTEST = 4.0  # standard deviations from a crop's mean at which its square root is clamped
+_SHIFT, _DEPTH = 0.05, 0.2  # shift of the head per unit of an output: relative to the depth, in log depth
+_ALPHA, _BETA = 0.3, 0.7  # standard deviations of the coefficients per unit, like the fit's priors
+_BRIGHTEST = 4.0  # largest deviation of a crop's square root from its mean, in standard deviations
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class GeometryEstimate(NamedTuple):
 class GeometryNetwork(SavedNetwork):
     """Estimate heads from crops [B, 3, S, S], scene-linear at any exposure and side."""
 
-    kind_of_settings = GeometryNetworkSettings  # which have the form
+    kind_of_settings = GeometryNetworkSettings  # includes the form
     mean_translation_m: Tensor
 
     def __init__(self, settings: GeometryNetworkSettings = GeometryNetworkSettings()) -> None:
@@ -71,7 +71,7 @@ class GeometryNetwork(SavedNetwork):
         return GeometryEstimate(_rotation(columns), self._translation(shift), _ALPHA * alpha, _BETA * beta)
 
     def _normalised(self, crops: Tensor) -> Tensor:
-        """Square roots of the crops at the network's side, each of zero mean and unit deviation."""
+        """Return square roots of the crops at the network's side, with zero mean and unit deviation."""
         crops = resize(crops, self.side)
         root = (crops.clamp_min(0) / crops.mean((1, 2, 3), keepdim=True).clamp_min(1e-8)).sqrt()
         centred = root - root.mean((1, 2, 3), keepdim=True)
@@ -86,7 +86,7 @@ class GeometryNetwork(SavedNetwork):
 
 
 def _rotation(columns: Tensor) -> Tensor:
-    """Rotations [B, 3, 3] from the differences [B, 6] of their first two columns to the identity's."""
+    """Return rotations [B, 3, 3] whose first two columns differ by [B, 6] from the identity's."""
     identity = torch.eye(2, 3, device=columns.device).flatten()
     first, second = (columns + identity).chunk(2, 1)
     x = F.normalize(first, dim=1)
@@ -95,7 +95,7 @@ def _rotation(columns: Tensor) -> Tensor:
 
 
 def _alexnet() -> tuple[nn.Module, int]:
-    """AlexNet without its last layer, and its number of outputs."""
+    """Return AlexNet without its last layer, and its number of outputs."""
 
     def convolution(channels: int, out: int, side: int, stride: int = 1, padding: int = 1) -> list[nn.Module]:
         return [nn.Conv2d(channels, out, side, stride, padding), nn.ReLU()]
@@ -121,9 +121,9 @@ def _alexnet() -> tuple[nn.Module, int]:
 
 
 def _small() -> tuple[nn.Module, int]:
-    """Five halvings, residual except the first, and a number of outputs.
+    """Return a trunk of five halvings, residual except the first, and its number of outputs.
 
-    The last cells are not pooled, since their positions carry the pose.
+    The last cells are not pooled, because their positions contain the pose.
     """
     widths = (24, 48, 88, 144, 192)
     enter = (nn.Conv2d(3, widths[0], 3, stride=2, padding=1), nn.GroupNorm(8, widths[0]), nn.SiLU())

@@ -1,6 +1,6 @@
-"""Parts that networks share: settings in checkpoints, precision, steps between a texture and their layers.
+"""Shared parts of networks: settings in checkpoints, batches, precision, and preparation of textures.
 
-These are exposure, colour cast, roots, resizing and head pose.
+Preparation comprises exposure, colour cast, roots, resizing and head pose.
 """
 
 import json
@@ -19,23 +19,20 @@ from torch import Tensor, nn
 from facerf_cli.run.logs import LOGGER_NAME
 
 log = logging.getLogger(LOGGER_NAME)
-MEAN_RADIANCE = 0.25  # of the visible face once its exposure is divided out
+MEAN_RADIANCE = 0.25  # of the visible face after division by its exposure
 _ROOT_OFFSET = 0.02  # keeps the slope of the root finite at black
-
-_DECODER_CHANNELS = 220  # that a decoder holds at once for each light, at its working side
-_TEXTURE_CHANNELS = 16  # that its output holds at once for each light, at the side of the texture
-_ORDINARY_CAST = 2.0  # standard deviations within which a colour cast is left to the network
-_BF16_CAPABILITY = 8  # of an NVIDIA GPU that computes in bfloat16
+_ORDINARY_CAST = 2.0  # standard deviations; smaller colour casts are left to the network
+_BF16_CAPABILITY = 8  # least compute capability of an NVIDIA GPU with bfloat16
 _NAMES = {"cpu": "processor", "cuda": "GPU"}
-_GREY = 1e-4  # difference of the channels of a grey image, of its mean, left by resampling
-_LEAST_DEVIATION = 0.02  # of a log ratio of colours: that of grey data would be 0
+_GREY = 1e-4  # difference of a grey image's channels relative to its mean, caused by resampling
+_LEAST_DEVIATION = 0.02  # of a log ratio of colours, because grey data have none
 
 
 @dataclass(frozen=True)
 class SourceColours:
-    """Colours of the sources that a network was trained on.
+    """Mean and covariance of log(red / green) and log(blue / green) of the sources of a network's training.
 
-    Mean and covariance of log(red / green) and log(blue / green) of the visible face's mean colour.
+    The colour of a source is the visible face's mean colour.
     """
 
     mean: tuple[float, float]
@@ -51,7 +48,7 @@ class SourceColours:
         return SourceColours((red, blue), ((a, b), (b, c)))
 
     def as_metadata(self) -> dict[str, Any]:
-        """Numbers for a checkpoint."""
+        """Return numbers for a checkpoint."""
         return asdict(self)
 
     @staticmethod
@@ -60,14 +57,14 @@ class SourceColours:
         red, blue = (float(value) for value in metadata["mean"])
         (a, b), (c, d) = ((float(x), float(y)) for x, y in metadata["covariance"])
         if not (a > 0 and d > 0 and b == c and a * d > b * b and all(map(math.isfinite, (red, blue, a, d)))):
-            raise ValueError(f"no colours of sources: {metadata}")
+            raise ValueError(f"not colours of sources: {metadata}")
         return SourceColours((red, blue), ((a, b), (c, d)))
 
 
 def exposure_of(texture: Tensor, visible: Tensor) -> Tensor:
-    """Exposure of linear textures [B, 3, T, T]: divided by it, their visible mean is `MEAN_RADIANCE`.
+    """Return the positive divisor [B, 1, 1, 1] that gives textures a visible mean of `MEAN_RADIANCE`.
 
-    visible [B, 1, T, T] in 0..1; the result is [B, 1, 1, 1] and positive.
+    texture [B, 3, T, T] linear; visible [B, 1, T, T] in 0..1.
     """
     radiance = (texture.mean(1, keepdim=True) * visible).sum((2, 3), keepdim=True)
     exposure = radiance / visible.sum((2, 3), keepdim=True).clamp_min(1e-6) / MEAN_RADIANCE
@@ -75,17 +72,17 @@ def exposure_of(texture: Tensor, visible: Tensor) -> Tensor:
 
 
 def colour_cast(texture: Tensor, visible: Tensor, trained: SourceColours) -> Tensor:
-    """Colour cast of the light on linear textures [B, 3, T, T], as far as it exceeds that of `trained`.
+    """Return the light's colour cast [B, 3, 1, 1], positive, beyond the range of the training data.
 
-    visible [B, 1, T, T] in 0..1; the result is [B, 3, 1, 1] and positive. Divide textures by it: their mean
-    radiance does not change. It is exactly 1 for ordinary photos. A colour further from the mean colour of
-    training than `_ORDINARY_CAST` is moved within that distance, and the further it is the closer to the
-    mean: the less usual the colour, the more certainly it is the light's.
+    texture [B, 3, T, T] linear; visible [B, 1, T, T] in 0..1. Dividing a texture by the cast keeps its mean
+    radiance. It is exactly 1 for ordinary photos. A colour beyond `_ORDINARY_CAST` from the training data's
+    mean moves within that distance; an unusual colour is probably the light's, so the farther away it is, the
+    closer to the mean it moves.
     """
     mean = mean_colours(texture, visible)
     red, blue = (part - middle for part, middle in zip(_chroma(mean).unbind(1), trained.mean, strict=True))
     (a, b), (_, c) = trained.covariance
-    # Mahalanobis distance, by the Cholesky factor of the covariance
+    # Mahalanobis distance from the Cholesky factor of the covariance
     distance = torch.hypot(red / a**0.5, (blue - red * (b / a)) / (c - b * b / a) ** 0.5)
     chroma = torch.stack([red, blue], 1)
     inside = (_ORDINARY_CAST / distance.clamp_min(1e-6)) ** 2
@@ -96,19 +93,19 @@ def colour_cast(texture: Tensor, visible: Tensor, trained: SourceColours) -> Ten
 
 
 def without_cast(texture: Tensor, visible: Tensor, trained: SourceColours | None) -> Tensor:
-    """Divide textures by their `colour_cast`, as in training; unchanged where the colours are unknown."""
+    """Divide textures by their `colour_cast`, like in training; if `trained` is None, do nothing."""
     return texture if trained is None else texture / colour_cast(texture.detach(), visible, trained)
 
 
 def is_grey(image: Tensor) -> bool:
-    """True for an image [3, ...] without colours; its person is predicted without colours, too."""
+    """Return whether an image [3, ...] is grey; then the person is also predicted in grey."""
     return bool((image - image[:1]).abs().max() <= _GREY * image.mean())
 
 
 def mean_colours(texture: Tensor, visible: Tensor) -> Tensor:
-    """Mean colours [B, 3], positive, float64, of the visible texels; visible [B, 1, T, T] in 0..1."""
-    seen = visible.sum((2, 3)).clamp_min(1e-6)
-    return ((texture * visible).sum((2, 3)) / seen).clamp_min(1e-6).double()
+    """Return positive mean colours [B, 3], float64, of the visible texels; visible [B, 1, T, T] in 0..1."""
+    area = visible.sum((2, 3)).clamp_min(1e-6)
+    return ((texture * visible).sum((2, 3)) / area).clamp_min(1e-6).double()
 
 
 def _chroma(colours: Tensor) -> Tensor:
@@ -116,17 +113,17 @@ def _chroma(colours: Tensor) -> Tensor:
 
 
 def to_root(radiance: Tensor) -> Tensor:
-    """Compress radiance for a network or a loss: nearly its square root, 0 at 0, with a finite slope."""
+    """Compress radiance for a network or a loss: approximately its square root, with a finite slope at 0."""
     return (radiance + _ROOT_OFFSET**2).sqrt() - _ROOT_OFFSET
 
 
 def from_root(root: Tensor) -> Tensor:
-    """Invert `to_root`; 0 for negative roots."""
+    """Invert `to_root`; negative roots become 0."""
     return root.clamp_min(0) * (root + 2 * _ROOT_OFFSET)
 
 
 def resize(x: Tensor, side: int) -> Tensor:
-    """Resample [B, C, H, W] to a side: averaged if that is smaller, bilinear if it is larger."""
+    """Resample [B, C, H, W] to a side: by averages for a smaller one, bilinearly for a larger one."""
     if x.shape[-1] == side:
         return x
     if x.shape[-1] > side:
@@ -138,10 +135,10 @@ def resize(x: Tensor, side: int) -> Tensor:
 
 
 def head_rotation(mean_normals: Tensor, normals: Tensor) -> Tensor:
-    """Estimate head_to_camera [B, 3, 3], which best rotates the mean face's normals to those of a face.
+    """Estimate head_to_camera [B, 3, 3], the rotation between the mean face's normals and a face's.
 
-    mean_normals [3, S, S] in the head frame, normals [B, 3, T, T] in camera space. The solution is that of
-    the orthogonal Procrustes problem.
+    mean_normals [3, S, S] in the head frame, normals [B, 3, T, T] in camera space. Solves the orthogonal
+    Procrustes problem.
     """
     small = resize(normals, mean_normals.shape[-1])
     if small.device.type == "mps":  # Apple's GPUs have no doubles
@@ -153,16 +150,8 @@ def head_rotation(mean_normals: Tensor, normals: Tensor) -> Tensor:
     return (u @ torch.diag_embed(signs) @ vt).to(normals)
 
 
-def decoder_bytes(side: int, texels: int) -> int:
-    """Memory of a reflectance decoder for one light of one face, for a texture of so many texels (T x T).
-
-    It is that of the form default, by count of channels enough for the form paper, too.
-    """
-    return 4 * (_DECODER_CHANNELS * side**2 + _TEXTURE_CHANNELS * texels)
-
-
 class Down(nn.Module):
-    """Halve the side (except in the first), then apply a residual convolution."""
+    """Halve the side (unless `first`), then apply a residual convolution."""
 
     def __init__(self, channels_in: int, channels_out: int, first: bool = False, groups: int = 4) -> None:
         super().__init__()
@@ -171,7 +160,7 @@ class Down(nn.Module):
         self.inner = nn.Conv2d(channels_out, channels_out, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Features [B, C, H, W] to [B, C', H / 2, W / 2], or to the same side."""
+        """Map features [B, C, H, W] to [B, C', H / 2, W / 2], or to the same side."""
         x = F.silu(self.norm(self.enter(x)))
         result: Tensor = x + F.silu(self.inner(x))
         return result
@@ -180,7 +169,7 @@ class Down(nn.Module):
 Count = Annotated[int, Field(ge=1, le=4096)]
 Side = Annotated[int, Field(ge=8, le=4096)]  # pixels or texels
 Grid = Annotated[int, Field(ge=1, le=64)]
-VggWidth = Annotated[float, Field(gt=0, le=4)]  # a share of the channels of VGG-16
+VggWidth = Annotated[float, Field(gt=0, le=4)]  # relative to the channels of VGG-16
 Landmarks = Annotated[int, Field(ge=68, le=256)]
 Classes = Annotated[int, Field(ge=2, le=256)]
 Widths = Annotated[tuple[Count, ...], Field(min_length=1, max_length=12)]
@@ -192,7 +181,7 @@ Blocks = Annotated[tuple[Annotated[int, Field(ge=0, le=8)], ...], Field(min_leng
 
 @dataclass(frozen=True)
 class Batch:
-    """Base of dataclasses whose fields are tensors [B, ...], or such dataclasses again."""
+    """Base of dataclasses whose fields are tensors [B, ...] or other batches."""
 
     def each(self, function: Callable[[Tensor], Tensor]) -> Self:
         """Apply a function to every tensor."""
@@ -200,15 +189,15 @@ class Batch:
         return type(self)(*(x.each(function) if isinstance(x, Batch) else function(x) for x in values))
 
     def to(self, device: torch.device) -> Self:
-        """Copy all tensors to `device`; a GPU goes on with its work meanwhile if they are pinned."""
+        """Copy all tensors to `device`; from pinned memory, a GPU copies them asynchronously."""
         return self.each(lambda values: values.to(device, non_blocking=device.type == "cuda"))
 
     def pin_memory(self) -> Self:
-        """The tensors in memory that a GPU reads by itself; the data loader calls this."""
+        """Return a copy in pinned memory; the data loader calls this."""
         return self.each(torch.Tensor.pin_memory)
 
     def parts(self, count: int) -> list[Self]:
-        """The samples in `count` batches of the same size."""
+        """Split the samples into `count` batches of the same size."""
         return [self.each(lambda values: values.chunk(count)[part]) for part in range(count)]  # noqa: B023
 
 
@@ -222,7 +211,7 @@ def concatenate(samples: Sequence[Samples]) -> Samples:
 
 
 class SavedNetwork(nn.Module):
-    """A network that a checkpoint describes by its form and its settings."""
+    """Network described in a checkpoint by its form and its settings."""
 
     form: ClassVar[str] = "default"
     kind_of_settings: ClassVar[type[Any]]  # a dataclass
@@ -232,30 +221,31 @@ class SavedNetwork(nn.Module):
         self.settings = settings
 
     def as_metadata(self) -> dict[str, Any]:
-        """Form and settings, for a checkpoint."""
+        """Return form and settings, for a checkpoint."""
         return {"form": self.form, **asdict(self.settings)}
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, Any]) -> Self:
-        """Make an untrained network; raises TypeError or ValueError if the settings make none."""
+        """Make an untrained network; raises TypeError or ValueError for invalid settings."""
         kind = cls.kind_of_settings
         known = {field.name for field in fields(kind)}
-        given = {name: value for name, value in metadata.items() if name != "form" or name in known}
-        if unknown := sorted(given.keys() - known):
+        settings = {name: value for name, value in metadata.items() if name != "form" or name in known}
+        if unknown := sorted(settings.keys() - known):
             raise TypeError(f"a network of this form has no {', '.join(unknown)}")
-        return cls(TypeAdapter(kind).validate_json(json.dumps(given), strict=True))  # JSON's lists are tuples
+        # from JSON, because strict pydantic accepts its lists as tuples
+        return cls(TypeAdapter(kind).validate_json(json.dumps(settings), strict=True))
 
 
 def mixed_precision(device: torch.device, wanted: bool) -> torch.autocast:
-    """Context in which a network computes in bfloat16, if that is `wanted`.
+    """Return a context for bfloat16 computations, if that is `wanted`.
 
-    A processor without instructions for bfloat16 emulates them and is a hundred times slower, and old GPUs
-    lack them, too: there the network stays in float32, and a line says so once.
+    Processors without bfloat16 instructions emulate them a hundred times more slowly, and old GPUs lack them.
+    There the network stays in float32, which is logged once.
     """
     return torch.autocast(device.type, torch.bfloat16, enabled=wanted and _has_bf16(device))
 
 
-@cache  # said once
+@cache  # logged once
 def _has_bf16(device: torch.device) -> bool:
     has: bool = device.type not in ("cpu", "cuda")
     if device.type == "cpu":

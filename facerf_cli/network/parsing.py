@@ -1,8 +1,8 @@
-"""The Parsing Network: from a crop around a person to classes, matte and landmarks.
+"""Parsing Network: from a crop around a person to classes, matte and landmarks.
 
 A small U-Net. Landmarks are the means of heatmaps (Sun et al., *Integral human pose regression*, 2018), each
-with its own expected error, as in Wood et al., *3D face reconstruction with dense landmarks*, 2022. Its
-training on synthetic portraits alone follows Wood et al., *Fake it till you make it*, 2021.
+with an expected error (Wood et al., *3D face reconstruction with dense landmarks*, 2022). It is trained only
+on synthetic portraits (Wood et al., *Fake it till you make it*, 2021).
 """
 
 import itertools
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from facerf_cli.network.inputs import Blocks, Classes, Landmarks, SavedNetwork, Side, WidthsOfFour
 
-_ALPHA_STEPS = 2  # pixels of the classes along each side of a pixel of the features
+_ALPHA_STEPS = 2  # pixels of the classes per pixel of the features, in each direction
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,11 @@ class Parsing(NamedTuple):
     logits: Tensor  # [B, C, S, S] of the classes; class 0 is the background
     landmarks: Tensor  # [B, N, 2] right and down, in sides of the crop
     log_error: Tensor  # [B, N] logarithm of each landmark's expected error, in sides of the crop
-    presence: Tensor  # [B] logit of a head being there
+    presence: Tensor  # [B] logit of a head's presence
 
     @property
     def classes(self) -> Tensor:
-        """Shares [B, C, S, S] of the classes; they sum to 1, and the matte is 1 less the background's."""
+        """Probabilities [B, C, S, S] of the classes; the matte is 1 less the background's."""
         return self.logits.float().softmax(1)
 
 
@@ -73,7 +73,7 @@ class Halving(nn.Module):
 
 
 class UNet(SavedNetwork):
-    """Halvings of an image, and the way back to half its side with skips."""
+    """Encoder that halves an image repeatedly, and decoder with skips up to half its side."""
 
     def __init__(self, settings: Any, channels: int) -> None:
         """Make an untrained network for images of some channels; `settings` has widths, blocks and a side."""
@@ -90,24 +90,24 @@ class UNet(SavedNetwork):
         self.decode = nn.ModuleList(Residual(a) for a, _ in pairs)
 
     def halved(self, images: Tensor) -> list[Tensor]:
-        """Features [B, C, H, W] of images [B, C, S, S], from side S / 2 to the coarsest."""
-        found = [self.stem(images)]
+        """Return features [B, C, H, W] of images [B, C, S, S], from side S / 2 to the coarsest."""
+        features = [self.stem(images)]
         for halving in self.encode:
-            found.append(halving(found[-1]))
-        return found
+            features.append(halving(features[-1]))
+        return features
 
     def doubled(self, halved: list[Tensor]) -> list[Tensor]:
-        """Features on the way back from the coarsest to side S / 2, without the coarsest."""
+        """Return decoded features from the coarsest to side S / 2, without the coarsest."""
         *skips, x = halved
-        found = []
+        features = []
         for narrow, decode, skip in reversed(list(zip(self.narrow, self.decode, skips, strict=True))):
             x = decode(skip + F.interpolate(narrow(x), scale_factor=2.0, mode="nearest"))
-            found.append(x)
-        return found
+            features.append(x)
+        return features
 
 
 class ParsingNetwork(UNet):
-    """Parse crops [B, 3, S, S] as a screen shows them (sRGB), of any brightness and contrast."""
+    """Parse crops [B, 3, S, S] in sRGB, with any brightness and contrast."""
 
     kind_of_settings = ParsingSettings
 
@@ -132,7 +132,7 @@ class ParsingNetwork(UNet):
 
 
 def _means(heat: Tensor) -> Tensor:
-    """Mean places [B, N, 2], right and down in sides, of heatmaps with logits [B, N, H, W]."""
+    """Return mean positions [B, N, 2], right and down in sides, of heatmaps with logits [B, N, H, W]."""
     height, width = heat.shape[-2:]
     share = heat.flatten(2).softmax(-1).view_as(heat)
     x = (torch.arange(width, device=heat.device) + 0.5) / width

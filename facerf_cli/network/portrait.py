@@ -1,4 +1,4 @@
-"""The Portrait Network: from a photo of a person to its light transport, as maps that every light shares.
+"""Portrait Network: from a photo of a person to its light transport, as maps that are shared by all lights.
 
     OLAT_l = A (V'_l (n . l)+ + (V'_l sum_k b_k(l) P_k + sum_k b_k(l) U_k)+) + V'_l G_l sum_j g_j lobe_j
 
@@ -29,8 +29,8 @@ _REACH = 3  # order of the spherical harmonics that summarise the proxy's visibi
 LIT_ORDER, SHADOW_ORDER = 3, 4  # of P and U; of W
 _SHARPNESS = (8.0, 45.0)  # exponents of the highlights about normals
 _STRAND_SHARPNESS = 30.0
-_TURNED = 0.15  # n . l at which highlights begin to fade, and, below 0, end
-_VIEW = (0.0, 0.0, 1.0)  # toward the camera, which is far
+_TURNED = 0.15  # highlights fade between this and the negative n . l
+_VIEW = (0.0, 0.0, 1.0)  # toward the distant camera
 _DIM = 0.15  # added to the proxy's shading before the photo is divided by it
 _FINE = {"gain": 3, "bias": 3, "normals": 3, "strands": 3, "gloss": len(_SHARPNESS) + 1, "trust": 1}
 _COARSE = {  # maps at half the side
@@ -43,7 +43,7 @@ _OUTPUTS = 4 * sum(_FINE.values()) + sum(_COARSE.values())
 
 @dataclass(frozen=True)
 class PortraitSettings:
-    """Channels at 1/2, 1/4, ... of the square's side, and residual blocks there; classes of the input."""
+    """Channels and residual blocks at 1/2, 1/4, ... of the square's side; classes of the input."""
 
     widths: WidthsOfFour = (40, 72, 120, 176, 208)
     blocks: Blocks = (1, 1, 2, 2, 2)
@@ -70,13 +70,13 @@ class PortraitInputs(Batch):
     own: Tensor
 
     def mirrored(self) -> "PortraitInputs":
-        """The people as a mirror shows them."""
-        seen = self.each(lambda layer: layer.flip(-1))
-        normals, reached = mirrored_x(seen.normals), mirrored_harmonics(seen.reached)
-        return replace(seen, normals=normals, reached=reached)
+        """Return the mirror images of the people."""
+        flipped = self.each(lambda layer: layer.flip(-1))
+        normals, reached = mirrored_x(flipped.normals), mirrored_harmonics(flipped.reached)
+        return replace(flipped, normals=normals, reached=reached)
 
     def stacked(self) -> Tensor:
-        """All of it [B, C, S, S] as the first layer sees it."""
+        """Return the input [B, C, S, S] of the first layer."""
         root = (self.image.clamp(0, 4) + 0.005).sqrt() - 0.5
         own = (self.own.clamp(0, 4) + 0.02).sqrt() - 1
         layers = (root, self.classes, self.normals, self.depth, self.covered, self.reached, own)
@@ -84,34 +84,34 @@ class PortraitInputs(Batch):
 
 
 def mirrored_x(vectors: Tensor) -> Tensor:
-    """Vectors [B, 3, S, S], x to the other side."""
+    """Negate x of vectors [B, 3, S, S]."""
     return torch.cat([-vectors[:, :1], vectors[:, 1:]], 1)
 
 
 def mirrored_harmonics(coefficients: Tensor) -> Tensor:
-    """Coefficients [B, K, S, S] of the function of (-x, y, z)."""
+    """Return coefficients [B, K, S, S] of the same function of (-x, y, z)."""
     signs = mirror_signs(coefficients.shape[1]).to(coefficients)
     return coefficients * signs.view(-1, 1, 1)
 
 
 def reached_by(directions: Tensor, visible: Tensor, side: int) -> Tensor:
-    """Spherical harmonics [K, side, side] of the visibility [L, s, s] of a rig [L, 3] all around."""
+    """Return spherical harmonics [K, side, side] of the visibility [L, s, s] of lights [L, 3] on a sphere."""
     basis = sh_basis(directions, _REACH) / len(directions)
     summary = torch.einsum("lk,lij->kij", basis, visible)
     return F.interpolate(summary[None] * 3, size=(side, side), mode="bilinear", align_corners=False)[0]
 
 
 def skin_exposure(image: Tensor, classes: Tensor) -> Tensor:
-    """Exposure [B, 1, 1, 1] of images [B, 3, S, S]: divided by it the skin's mean is `MEAN_RADIANCE`."""
+    """Return the divisor [B, 1, 1, 1] that gives images [B, 3, S, S] a mean of `MEAN_RADIANCE` on skin."""
     skin = classes[:, SKIN : SKIN + 1]
     mean = (image.mean(1, keepdim=True) * skin).sum((2, 3), keepdim=True)
     return (mean / skin.sum((2, 3), keepdim=True).clamp_min(1e-3) / MEAN_RADIANCE).clamp_min(1e-6)
 
 
 class PortraitMaps(NamedTuple):
-    """Maps of B people, [B, C, S, S], the last three of half the side.
+    """Maps of B people, [B, C, S, S]; the last three have half the side.
 
-    Albedo is in the units of the exposed image; hair is the share of what has strands.
+    Albedo is in the units of the exposed image; hair is the fraction covered by strands.
     """
 
     gain: Tensor
@@ -127,7 +127,7 @@ class PortraitMaps(NamedTuple):
     shadow: Tensor
 
     def mirrored(self) -> "PortraitMaps":
-        """Maps of the people as a mirror shows them: under mirrored lights their images are mirrored."""
+        """Return maps whose images are mirrored under mirrored lights."""
         maps = PortraitMaps(*(values.flip(-1) for values in self))
         return maps._replace(
             normals=mirrored_x(maps.normals),
@@ -138,8 +138,8 @@ class PortraitMaps(NamedTuple):
         )
 
     def averaged(self, other: "PortraitMaps") -> "PortraitMaps":
-        """Mean of two predictions; a strand and its opposite are the same."""
-        mean = PortraitMaps(*((one + two) / 2 for one, two in zip(self, other, strict=True)))
+        """Return the mean of two predictions; a strand equals its opposite."""
+        mean = PortraitMaps(*((a + b) / 2 for a, b in zip(self, other, strict=True)))
         alike = (self.strands * other.strands).sum(1, keepdim=True).sign()
         return mean._replace(
             normals=F.normalize(mean.normals, dim=1),
@@ -147,15 +147,15 @@ class PortraitMaps(NamedTuple):
         )
 
     def without_colours(self) -> "PortraitMaps":
-        """Maps of people whose photos are grey: what has colours, without them."""
+        """Return maps with grey gain, bias and albedo, for grey photos."""
         grey = {name: getattr(self, name).mean(1, keepdim=True) for name in ("gain", "bias", "albedo")}
         return self._replace(**{name: values.expand(-1, 3, -1, -1) for name, values in grey.items()})
 
     def shaded(self, lights: Tensor, visible: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Shading, highlights and corrected visibility [B, L, S, S] under lights [B, L, 3].
+        """Return shading, highlights and corrected visibility [B, L, S, S] under lights [B, L, 3].
 
         `visible` [B, L, S, S] is the proxy's visibility. The image of a light is albedo times shading plus
-        highlights. Lights that are near have a direction for each pixel, [B, L, S, S, 3].
+        highlights. Near lights have a direction per pixel, [B, L, S, S, 3].
         """
         near = lights.dim() == 5
         product = "blijc,bcij->blij" if near else "blc,bcij->blij"
@@ -182,20 +182,20 @@ class PortraitMaps(NamedTuple):
         return shading, visible * torch.maximum(facing, self.hair) * glow, visible
 
     def olats(self, lights: Tensor, visible: Tensor) -> Tensor:
-        """Images [B, L, 3, S, S] under single lights of rgb 1; see `shaded`."""
+        """Return images [B, L, 3, S, S] under single lights of rgb 1; see `shaded`."""
         shading, glow, _ = self.shaded(lights, visible)
         return self.albedo[:, None] * shading[:, :, None] + glow[:, :, None]
 
 
 def _halved(directions: Tensor) -> Tensor:
-    """Unit directions [B, L, S, S, 3] at half the side."""
+    """Return unit directions [B, L, S, S, 3] at half the side."""
     people, lights, side = directions.shape[:3]
     blocks = directions.view(people, lights, side // 2, 2, side // 2, 2, 3)
     return F.normalize(blocks.mean((3, 5)), dim=-1)
 
 
 class PortraitNetwork(UNet):
-    """Predict the maps of people from `PortraitInputs`, by a small U-Net."""
+    """Predict the maps of people from `PortraitInputs` with a small U-Net."""
 
     kind_of_settings = PortraitSettings
 
@@ -220,7 +220,7 @@ class PortraitNetwork(UNet):
 
 
 def _maps(raw: dict[str, Tensor], inputs: PortraitInputs) -> PortraitMaps:
-    """Maps of the last layer's channels."""
+    """Return the maps for the last layer's channels."""
     gain = torch.exp(raw["gain"].clamp(-4, 4)) * (1 + _DIM) / (inputs.own + _DIM)
     bias = 0.1 * F.softplus(raw["bias"] - 3)
     return PortraitMaps(

@@ -1,10 +1,10 @@
-"""The Reflectance Network of this project: form `default`.
+"""Reflectance Network of this project: form `default`.
 
-It predicts a texture under any single light from one texture (paper, 'Network Architecture'). It departs from
-the paper's network in three ways that learn faster: the light also enters the decoder, as maps in UV space
-(cosine, half vector, the mean face's shadow) and as feature-wise modulation; the output is
+It predicts a texture under any single light from one texture (paper, 'Network Architecture'). It differs from
+the paper's network in three ways that make it learn faster: the light also enters the decoder, as maps in UV
+space (cosine, half vector, the mean face's shadow) and as feature-wise modulation; the output is
 `source x gain + bias` in square-root space; and the network works at a fixed side, while gain and bias are
-applied at the side of the texture.
+applied at the texture's side.
 """
 
 from dataclasses import dataclass
@@ -16,31 +16,30 @@ from torch import Tensor, nn
 from facerf_cli.network.inputs import (
     Count,
     Down,
-    SavedNetwork,
     Side,
     Widths,
-    decoder_bytes,
     exposure_of,
     from_root,
     head_rotation,
     resize,
 )
+from facerf_cli.network.reflectance import ReflectanceNetwork
 
 _MAP_SIDE = 64  # of the stored normals and shadows of the mean face
-_DARKEST = 1e-8  # radiance at which the slope of the square root is still finite
-_STEEP = 1e-3  # radiance below which gradients do not grow any more
+_DARKEST = 1e-8  # least radiance, to keep the slope of the square root finite
+_STEEP = 1e-3  # radiance below which gradients no longer grow
 _LIGHT_MAPS = 4  # cosine, gloss, shadow and base gain
-_LIGHT_FEATURES = 12  # numbers that describe a light: camera and head direction, products of the latter
-_CODE_CHANNELS = 96  # of the light's code, which modulates the decoder
+_LIGHT_FEATURES = 12  # numbers per light: camera and head direction, products of the latter
+_CODE_CHANNELS = 96  # of the light code that modulates the decoder
 _KERNEL_SHARPNESS = 70.0  # of the interpolation between the shadow maps of neighbouring lights
 
 
 @dataclass(frozen=True)
 class DefaultReflectanceSettings:
-    """Channels of encoder and decoder at each halving of the working side (side, side / 2, ...), and more.
+    """Channels of encoder and decoder at each halving of the working side, and other sizes.
 
-    `rig_lights` is the number of lights whose shadows on the mean face are stored. `normals` False replaces
-    normal maps by zeros (paper, 'Ablative Study').
+    `rig_lights` is the number of lights whose shadows on the mean face are stored. If `normals` is False,
+    zeros replace the normal maps (paper, 'Ablative Study').
     """
 
     side: Side = 128
@@ -53,18 +52,15 @@ class DefaultReflectanceSettings:
 
 @dataclass(frozen=True)
 class DefaultEncoded:
-    """B encoded faces: what the decoder takes of them for any light, and what the output needs of the source.
+    """B encoded faces: inputs of the decoder for any light, and the source for its output."""
 
-    `bottom` enters the decoder; `skips` join it from fine to coarse.
-    """
-
-    bottom: Tensor
-    skips: list[Tensor]
+    bottom: Tensor  # coarsest features
+    skips: list[Tensor]  # from fine to coarse
     source_root: Tensor  # [B, 3, T, T] square root of the source over its exposure
-    exposure: Tensor  # [B, 1, 1, 1] what the source was divided by
+    exposure: Tensor  # [B, 1, 1, 1] divisor of the source
 
 
-class DefaultReflectanceNetwork(SavedNetwork):
+class DefaultReflectanceNetwork(ReflectanceNetwork):
     """Predict OLAT textures, scene-linear and non-negative, from T_s, N_s, N_t and light directions."""
 
     kind_of_settings = DefaultReflectanceSettings
@@ -74,7 +70,8 @@ class DefaultReflectanceNetwork(SavedNetwork):
 
     def __init__(self, settings: DefaultReflectanceSettings = DefaultReflectanceSettings()) -> None:
         super().__init__(settings)
-        enc, dec, rig_lights = settings.encoder_widths, settings.decoder_widths, settings.rig_lights
+        enc, dec = settings.encoder_widths, settings.decoder_widths
+        self.rig_lights = rig_lights = settings.rig_lights
         self.template = nn.Parameter(torch.empty(settings.template_channels, 32, 32))
         nn.init.normal_(self.template, std=0.1)
         widths = (7 + settings.template_channels, *enc)
@@ -102,20 +99,12 @@ class DefaultReflectanceNetwork(SavedNetwork):
         self.register_buffer("rig", torch.zeros(rig_lights, 3))
 
     @property
-    def rig_lights(self) -> int:
-        """Number of lights whose shadows on the mean face are stored."""
-        return self.settings.rig_lights
-
-    @property
     def has_mean_face(self) -> bool:
-        """True once `set_mean_face` has stored the mean face."""
+        """Whether `set_mean_face` has stored the mean face."""
         return bool(self.mean_normals.any())
 
     def set_mean_face(self, normals: Tensor, visibility: Tensor, directions: Tensor) -> None:
-        """Store the mean face (head frame): normals [3, T, T], visibility [L, T, T], directions [L, 3].
-
-        Raises ValueError if L is not `rig_lights`.
-        """
+        """Store the mean face; see `ReflectanceNetwork`."""
         if len(directions) != len(self.rig):
             raise ValueError(
                 f"the network stores the shadows of {len(self.rig)} lights, not of {len(directions)}"
@@ -125,16 +114,12 @@ class DefaultReflectanceNetwork(SavedNetwork):
         self.mean_visibility.copy_((F.interpolate(visibility[None], size, mode="area")[0] * 255).round())
         self.rig.copy_(directions)
 
-    def bytes_per_light(self, texels: int) -> int:
-        """Memory of the decoder for one light of one face, for a texture of so many texels (T x T)."""
-        return decoder_bytes(self.settings.side, texels)
-
     def encode(self, texture: Tensor, normals_source: Tensor, visible: Tensor) -> DefaultEncoded:
         """Encode linear textures and camera-space normals [B, 3, T, T]; visible [B, 1, T, T] in 0..1."""
         exposure = exposure_of(texture, visible)
         radiance = texture / exposure
         source_root = radiance.clamp_min(_DARKEST).sqrt()
-        if radiance.requires_grad:  # else black texels, where the root is steep, lead the gradient
+        if radiance.requires_grad:  # else black texels, where the root is steep, dominate the gradient
             bounded = source_root.detach() / (radiance.detach() + _STEEP).sqrt()
             radiance.register_hook(bounded.mul)  # type: ignore[no-untyped-call]
         side = self.settings.side
@@ -145,8 +130,8 @@ class DefaultReflectanceNetwork(SavedNetwork):
         for down in self.down:
             x = down(x)
             features.append(x)
-        skips = [up.get_submodule("skip")(one) for up, one in zip(self.up, features, strict=True)]
-        return DefaultEncoded(self.bottleneck(x), skips, source_root, exposure)
+        skips = [up.get_submodule("skip")(x) for up, x in zip(self.up, features, strict=True)]
+        return DefaultEncoded(self.bottleneck(features[-1]), skips, source_root, exposure)
 
     def decode(self, encoded: DefaultEncoded, normals_target: Tensor, lights: Tensor) -> Tensor:
         """Decode OLAT textures [B, L, 3, T, T] for camera-space lights [B, L, 3], normals [B, 3, T, T]."""
@@ -160,9 +145,9 @@ class DefaultReflectanceNetwork(SavedNetwork):
         x, coarser = encoded.bottom.repeat_interleave(count, 0), [maps]
         for skip in encoded.skips[1:]:
             coarser.append(resize(coarser[-1], skip.shape[-1]))
-        every = zip(reversed(self.up), reversed(encoded.skips), reversed(coarser), strict=True)
-        for up, skip, some in every:
-            x = up(x, skip, some, code, count)
+        layers = zip(reversed(self.up), reversed(encoded.skips), reversed(coarser), strict=True)
+        for up, skip, light_maps in layers:
+            x = up(x, skip, light_maps, code, count)
         gain, bias = self.head(x).float().chunk(2, 1)
         both = resize(torch.cat([gain + base, bias], 1), encoded.source_root.shape[-1])
         gain, bias = both.chunk(2, 1)
@@ -173,7 +158,7 @@ class DefaultReflectanceNetwork(SavedNetwork):
         return normals if self.settings.normals else torch.zeros_like(normals)
 
     def _light_inputs(self, normals_target: Tensor, lights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Light maps [B*L, 4, T', T'], Lambert's base gain [B*L, 1, T', T'], light codes [B*L, 96]."""
+        """Return light maps [B*L, 4, T', T'], Lambert's base gain [B*L, 1, T', T'], light codes [B*L, 96]."""
         normals = resize(normals_target, self.settings.side)
         head_to_camera = head_rotation(self.mean_normals, normals_target)
         lights_head = lights @ head_to_camera  # row vectors: R^T w
@@ -191,14 +176,14 @@ class DefaultReflectanceNetwork(SavedNetwork):
         return maps, base.flatten(0, 1)[:, None], self.light_code(features)
 
     def _mean_shadow(self, lights_head: Tensor) -> Tensor:
-        """Visibility of the mean face [B, L, T'', T''], interpolated between the stored directions."""
+        """Interpolate the mean face's visibility [B, L, T'', T''] between the stored directions."""
         weights = (_KERNEL_SHARPNESS * (lights_head @ self.rig.T)).softmax(-1)
         flat = weights @ self.mean_visibility.to(weights).flatten(1) / 255
         return flat.view(*flat.shape[:2], _MAP_SIDE, _MAP_SIDE)
 
 
 class LitUp(nn.Module):
-    """Double the side (except in the coarsest), add skip and light maps, modulate by the light's code."""
+    """Double the side (except at the coarsest level), add skip and light maps, modulate by the light code."""
 
     def __init__(self, channels_in: int, channels_out: int, skip_channels: int, coarsest: bool) -> None:
         super().__init__()
@@ -215,11 +200,11 @@ class LitUp(nn.Module):
         """Return features [B * lights, C, H, W].
 
         Args:
-            x: Features from below [B * lights, C, h, w].
-            skip: What the face's features add [B, C, H, W]: those of `skip`.
-            maps: Maps of the lights [B * lights, C, H, W].
-            code: Codes of the lights [B * lights, C].
-            lights: Lights of each face.
+            x: Coarser features [B * lights, C, h, w].
+            skip: Output [B, C, H, W] of the layer `skip` for the face's features.
+            maps: Light maps [B * lights, C, H, W].
+            code: Light codes [B * lights, C].
+            lights: Number of lights per face.
         """
         x = self.enter(x)
         if self.scale == 2:

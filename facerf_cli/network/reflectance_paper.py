@@ -1,16 +1,16 @@
-"""The Reflectance Network of the paper ('Network Architecture'): form `paper`.
+"""Reflectance Network of the paper ('Network Architecture'): form `paper`.
 
 A U-Net of 8 down and 8 up convolutions, 3 x 3, with skips, over the source texture T_s and its normals N_s at
-512 x 512; the light direction enters at its bottleneck of 2 x 2. Five convolutions of stride 1 follow, over
-its features and the target's normals N_t, and give the texture T_t. The down path runs once a face, the rest
-once a light. At a smaller working side the layers are the same; those that find a single texel keep it.
+512 x 512; the light direction enters at its bottleneck of 2 x 2. Five convolutions of stride 1 follow; they
+map its features and the target's normals N_t to the texture T_t. The down path runs once per face, the other
+layers once per light. A smaller working side has the same layers; a side of one texel is not halved.
 
-The paper leaves these open: channels are 64 to 512, as is usual for such networks; a down convolution has
-stride 2, an up convolution follows an upsampling by nearest neighbours; each of the U-Net's convolutions
-except the first is followed by group normalisation, and each by a leaky rectifier; the five convolutions
-after it have rectifiers and no normalisation; a linear layer spreads the light's three numbers over as many
-channels as the bottleneck has; the source is divided by its exposure and the output multiplied by it; and the
-network reads and predicts square roots, which separate shadows as display encodings do.
+The paper does not specify the following. Channels are 64 to 512, which is usual for such networks. A down
+convolution has stride 2; an up convolution follows nearest-neighbour upsampling. Group normalisation follows
+each of the U-Net's convolutions except the first, and a leaky rectifier follows each of them; the five
+convolutions after the U-Net have rectifiers and no normalisation. A linear layer maps the light's three
+numbers to the bottleneck's number of channels. The source is divided by its exposure, and the output is
+multiplied by it. The network reads and predicts square roots, which separate shadows like display encodings.
 """
 
 from dataclasses import dataclass
@@ -22,26 +22,25 @@ from torch import Tensor, nn
 
 from facerf_cli.network.inputs import (
     Count,
-    SavedNetwork,
     Side,
     Widths,
-    decoder_bytes,
     exposure_of,
     resize,
     to_root,
 )
+from facerf_cli.network.reflectance import ReflectanceNetwork
 
 _SLOPE = 0.2  # of the leaky rectifiers
 _GROUPS = 4  # of the group normalisations
 _LIGHT_CONVOLUTIONS = 5  # over the U-Net's features and the target's normals
-_FIRST_ROOT = 0.3  # square root of the radiance that an untrained network predicts everywhere, about
+_FIRST_ROOT = 0.3  # approximate square root of the radiance that an untrained network predicts everywhere
 
 
 @dataclass(frozen=True)
 class PaperReflectanceSettings:
-    """Working side, channels after each halving of it, channels of the U-Net's output, and an ablation.
+    """Working side, channels after each halving of it, and channels of the U-Net's output.
 
-    `normals` False leaves N_s and N_t out (paper, 'Ablative Study').
+    If `normals` is False, N_s and N_t are left out (paper, 'Ablative Study').
     """
 
     side: Side = 512
@@ -52,20 +51,18 @@ class PaperReflectanceSettings:
 
 @dataclass(frozen=True)
 class PaperEncoded:
-    """B encoded faces: features of the down path from fine to coarse, and what the output needs."""
+    """B encoded faces."""
 
-    features: list[Tensor]
-    exposure: Tensor  # [B, 1, 1, 1] what the source was divided by
+    features: list[Tensor]  # of the down path, from fine to coarse
+    exposure: Tensor  # [B, 1, 1, 1] divisor of the source
     texture_side: int
 
 
-class PaperReflectanceNetwork(SavedNetwork):
+class PaperReflectanceNetwork(ReflectanceNetwork):
     """Predict OLAT textures, scene-linear and non-negative, from T_s, N_s, N_t and light directions."""
 
     form = "paper"
     kind_of_settings = PaperReflectanceSettings
-    rig_lights = 0  # it needs no mean face,
-    has_mean_face = False  # so it never stores one
 
     def __init__(self, settings: PaperReflectanceSettings = PaperReflectanceSettings()) -> None:
         super().__init__(settings)
@@ -77,7 +74,7 @@ class PaperReflectanceNetwork(SavedNetwork):
             _DownConvolution(a, b, first=i == 0) for i, (a, b) in enumerate(zip(before, widths, strict=True))
         )
         self.light = nn.Linear(3, widths[-1])
-        # From fine to coarse, as the down path; the coarsest takes the light's code in place of a skip.
+        # From fine to coarse, like the down path; the coarsest takes the light's code instead of a skip.
         after = (features, *widths[:-1])
         self.up = nn.ModuleList(_UpConvolution(a, a, b) for a, b in zip(widths, after, strict=True))
         channels = (features + maps, *[features] * (_LIGHT_CONVOLUTIONS - 1))
@@ -85,23 +82,13 @@ class PaperReflectanceNetwork(SavedNetwork):
             nn.Conv2d(c, features if i + 1 < _LIGHT_CONVOLUTIONS else 3, 3, padding=1)
             for i, c in enumerate(channels)
         )
-        self._initialise_grey()
-
-    def _initialise_grey(self) -> None:
-        """Set weights with which the network predicts about `_FIRST_ROOT` everywhere."""
+        # predict about `_FIRST_ROOT` everywhere
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, a=_SLOPE)
         last: Any = self.light_convolutions[-1]
         nn.init.normal_(last.weight, std=1e-2)
         nn.init.constant_(last.bias, float(torch.tensor(_FIRST_ROOT, device="cpu").expm1().log()))
-
-    def set_mean_face(self, normals: Tensor, visibility: Tensor, directions: Tensor) -> None:
-        """Do nothing: this form needs no mean face."""
-
-    def bytes_per_light(self, texels: int) -> int:
-        """Memory of the decoder for one light of one face, for a texture of so many texels (T x T)."""
-        return decoder_bytes(self.settings.side, texels)
 
     def encode(self, texture: Tensor, normals_source: Tensor, visible: Tensor) -> PaperEncoded:
         """Encode linear textures and camera-space normals [B, 3, T, T]; visible [B, 1, T, T] in 0..1."""
@@ -176,7 +163,7 @@ def _upsampled(x: Tensor, side: int) -> Tensor:
 
 
 def _halved_sides(side: int, times: int) -> list[int]:
-    """Sides after each halving; a side of one texel stays. Raises ValueError for an odd side above 1."""
+    """Return the sides after each halving down to 1; raises ValueError for an odd side above 1."""
     sides = [side]
     for _ in range(times):
         if sides[-1] > 1 and sides[-1] % 2:

@@ -1,7 +1,7 @@
-"""Networks whose operators are stored beside their weights: MediaPipe's (`tools/mediapipe_weights.py`).
+"""Networks stored with their operators: MediaPipe's (`tools/mediapipe_weights.py`).
 
-A step of the stored graph is `[operator, inputs, output, settings]`: inputs are numbers of values that
-earlier steps made (0 is the image) or names of weights. Values of four dimensions are [B, C, H, W].
+A step of the stored graph is `[operator, inputs, output, settings]`: inputs are numbers of earlier outputs (0
+is the image) or names of weights. Values of four dimensions are [B, C, H, W].
 """
 
 import json
@@ -23,9 +23,9 @@ ASSET = Path(__file__).parents[1] / "assets" / "mediapipe.safetensors"
 
 
 class StoredGraph(nn.Module):
-    """A network of the asset by its name; its operators run one after the other.
+    """Network of the asset, selected by name; its operators run in sequence.
 
-    `forward` takes images [B, 3, H, W] float32 of the size and range that the network was trained for, on any
+    `forward` takes images [B, 3, H, W] float32 with the size and range of the network's training, on any
     device, and returns the outputs by name, on the CPU.
     """
 
@@ -59,10 +59,10 @@ class StoredGraph(nn.Module):
 
 @dataclass(frozen=True)
 class PeopleNetworks:
-    """The networks that find people in a photo and cut them out.
+    """Networks that find people in a photo and segment them.
 
-    MediaPipe's find faces, near and far ones, the mesh of a face, what is a person, and whose body is whose;
-    ours knows the classes of a person's pixels.
+    MediaPipe's detect near and far faces, fit the mesh of a face, segment people, and detect bodies; facerf's
+    classifies a person's pixels.
     """
 
     parsing: ParsingNetwork
@@ -73,9 +73,9 @@ class PeopleNetworks:
     body: StoredGraph
 
 
-@cache  # loaded once a device
+@cache  # loaded once per device
 def mediapipe_networks(device: torch.device) -> tuple[StoredGraph, ...]:
-    """MediaPipe's networks on a device, in the order of `PeopleNetworks`."""
+    """Load MediaPipe's networks on a device, in the order of `PeopleNetworks`."""
     names = [field.name for field in fields(PeopleNetworks)][1:]
     return tuple(StoredGraph(name).to(device) for name in names)
 
@@ -100,7 +100,7 @@ def _convolve(
 def _convolve_transposed(
     x: Tensor, weight: Tensor, bias: Tensor, *, stride: list[int], crop: list[int], size: list[int]
 ) -> Tensor:
-    """The full result, cropped from row and column `crop` on."""
+    """Return the result cropped to `size`, starting at row and column `crop`."""
     (top, left), (height, width) = crop, size
     return F.conv_transpose2d(x, weight, bias, stride)[:, :, top : top + height, left : left + width]
 
@@ -114,7 +114,7 @@ def _mean(x: Tensor, *, kernel: list[int], stride: list[int]) -> Tensor:
 
 
 def _resize(x: Tensor, *, size: list[int], align_corners: bool, half_pixel: bool) -> Tensor:
-    """Bilinear; without either flag a sample lies at its index times the scale, which torch does not have."""
+    """Resize bilinearly; torch lacks the case without a flag: samples at their index times the scale."""
     if align_corners or half_pixel:
         return F.interpolate(x, tuple(size), mode="bilinear", align_corners=align_corners)
     for axis, count in ((2, size[0]), (3, size[1])):
@@ -135,21 +135,21 @@ def _depth_to_space(x: Tensor, *, block: int) -> Tensor:
 
 
 def _flatten(x: Tensor, *, shape: list[int]) -> Tensor:
-    """Values in the order rows, columns, channels, as [B, *shape]."""
+    """Return values in the order rows, columns, channels, as [B, *shape]."""
     last = x.permute(0, 2, 3, 1) if x.dim() == 4 else x
     return last.reshape(len(x), *shape)
 
 
 def _to_image(x: Tensor, *, shape: list[int]) -> Tensor:
-    """Values [B, ...] in the order rows, columns, channels as an image [B, C, H, W]."""
+    """Return values [B, ...] in the order rows, columns, channels as an image [B, C, H, W]."""
     return x.reshape(len(x), *shape).permute(0, 3, 1, 2)
 
 
 def _turned_crop(points: Tensor, *, scale: list[float], size: list[int], **places: Any) -> Tensor:
-    """Matrix [B, 2, 3] from pixels of an upright crop around some of points [B, N, 3] to pixels of theirs.
+    """Return the matrix [B, 2, 3] from pixels of an upright crop to pixels of the points [B, N, 3].
 
-    `places`: indices of the points `inside`, of the `left` and the `right` point that the crop is level with,
-    and a further turn in radians.
+    `places`: indices of the points `inside` the crop and of the points `left` and `right` on its horizontal
+    axis, and an additional rotation in radians, `turn_rad`.
     """
     across_x, across_y = (points[:, places["right"], :2] - points[:, places["left"], :2]).unbind(-1)
     angle = torch.atan2(across_y, across_x) - places["turn_rad"]
@@ -164,7 +164,7 @@ def _turned_crop(points: Tensor, *, scale: list[float], size: list[int], **place
 
 
 def _crop(x: Tensor, matrix: Tensor, *, size: list[int]) -> Tensor:
-    """The crop [B, C, *size] of a map of features; 0 where it lies outside."""
+    """Crop a map of features to [B, C, *size]; values outside the map are 0."""
     extent = x.new_tensor([x.shape[3], x.shape[2]])
     v, u = (torch.arange(count, device=x.device) + 0.5 for count in size)
     grid = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
@@ -174,7 +174,7 @@ def _crop(x: Tensor, matrix: Tensor, *, size: list[int]) -> Tensor:
 
 
 def _uncrop(points: Tensor, matrix: Tensor) -> Tensor:
-    """Points [B, N, 2 or 3] of a crop back where it was cut; a third coordinate stays."""
+    """Map points [B, N, 2 or 3] of a crop to the original image; a third coordinate stays unchanged."""
     place = points[..., :2] @ matrix[..., :2].transpose(1, 2) + matrix[:, None, :, 2]
     return torch.cat([place, points[..., 2:]], -1)
 

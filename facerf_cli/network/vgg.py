@@ -1,4 +1,4 @@
-"""VGG-16 of torchvision, downloaded once or from a file: the start of V_f, the paper's image features."""
+"""VGG-16 of torchvision, downloaded once or read from a file: the paper's image features V_f."""
 
 from pathlib import Path
 
@@ -16,18 +16,18 @@ VGG16 = PublishedFile(
 VGG16_LICENCE = (
     "VGG-16: torchvision (BSD-3-Clause), trained on ImageNet (pictures for non-commercial research)"
 )
-_VGG_ADVICE = "give --vgg-weights imagenet, or a .pth or .safetensors of torchvision's vgg16-397923af"
+_VGG_ADVICE = "use --vgg-weights imagenet, or a .pth or .safetensors of torchvision's vgg16-397923af"
 
 
 def load_vgg(choice: str | Path | None, network: VggFeatures | None = None) -> VggFeatures:
     """Load V_f, frozen, for a value of `--vgg-weights`: 'imagenet', or a .pth or .safetensors of VGG-16.
 
     'imagenet' is downloaded once and verified; a file must have torchvision's names. Pickles are read with
-    `weights_only`. None raises UsageError. `network`, if given, gets the weights instead of a new V_f.
+    `weights_only`. `network` receives the weights instead of a new V_f. Raises UsageError for None.
     """
     if choice is None:
         raise UsageError(
-            "--vgg-weights: missing, and the feature loss needs VGG-16; give --vgg-weights imagenet "
+            "--vgg-weights: missing, but the feature loss needs VGG-16; use --vgg-weights imagenet "
             "(downloads 528 MiB once), or --vgg-weights PATH of torchvision's vgg16-397923af.pth; training "
             "also takes --appearance-features FILE"
         )

@@ -11,8 +11,7 @@ from facerf_cli.dataset.faces import DatasetFaces, open_faces
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.morphable import load_face_model, save_face_model
 from facerf_cli.light.transport import BakeSettings
-from facerf_cli.network.checkpoint import form_of, new_network
-from facerf_cli.network.installed import installed
+from facerf_cli.network.checkpoint import form_of, installed_class, new_network
 from facerf_cli.relighting.models import Networks
 from facerf_cli.synth.bank.backgrounds import BACKGROUND_HEAPS, BACKGROUND_MAPS, load_backgrounds
 from facerf_cli.synth.bank.heads import HeadBakeSettings, add_views, bake_heads, load_bank
@@ -78,7 +77,7 @@ class Run:
         name = self.options.objective
         if name is None:
             return kind
-        own = installed(name, "--objective")
+        own = installed_class(name, "--objective")
         if not issubclass(own, kind):
             needed = f"{kind.__module__}:{kind.__name__}"
             raise UsageError(f"--objective {name}: not a subclass of {needed}, the stage's own; use one")

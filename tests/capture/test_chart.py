@@ -1,9 +1,7 @@
 """The colour chart: its colours, its geometry, and the fit, against rendered charts and colour-science."""
 
-import json
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +13,12 @@ from facerf_cli.capture.capture import Capture, ChartCorrection, correct_colours
 from facerf_cli.capture.chart import (
     GREYS,
     fit_colours,
-    four_turns,
     published_colours,
     read_charts,
     sample,
-    squares_px,
-    write_chart_overlays,
 )
 from facerf_cli.capture.layouts import read_capture
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.image.colour import (
     REC709_CHROMATICITIES,
@@ -33,7 +27,7 @@ from facerf_cli.image.colour import (
     matrix_to_rec709,
     rgb_to_xyz,
 )
-from tests.capture.chart_image import CAMERA, CORNERS, SHAPE, chart_image, kept_luminance
+from tests.capture.chart_image import CAMERA, CORNERS, chart_image, kept_luminance
 from tests.refusals import refused
 from tests.worlds import FLAT, write_flat_stage
 
@@ -81,8 +75,8 @@ def test_the_middles_are_sampled() -> None:
         sample(chart_image(noise=0.0, exposure=1.0), CORNERS), published_colours(), atol=1e-6
     )
     careless = CORNERS + np.array([[4, -4], [-4, 4], [4, 4], [-4, -4]])
-    found = sample(chart_image(noise=0.0, exposure=1.0), careless)
-    np.testing.assert_allclose(found, published_colours(), atol=1e-6)
+    sampled = sample(chart_image(noise=0.0, exposure=1.0), careless)
+    np.testing.assert_allclose(sampled, published_colours(), atol=1e-6)
 
 
 WHITE = [{**light, "intensity": [2, 2, 2]} for light in FLAT["lights"]]
@@ -122,13 +116,6 @@ def test_a_camera_with_noise_is_undone_and_lamps_of_one_colour_change_nothing(tm
         np.testing.assert_allclose(chart.record["matrix"], kept_luminance(CAMERA), atol=5e-3)
 
 
-@pytest.mark.parametrize("turn", [1, 2])
-def test_corners_begin_anywhere_and_go_either_way(tmp_path: Path, turn: int) -> None:
-    corners = four_turns(CORNERS)[turn][:: -1 if turn % 2 else 1]
-    chart = correction(tmp_path, chart_image(matrix=CAMERA), corners)
-    assert chart.record["corners_px"] == CORNERS.tolist() and delta_e(chart) < 0.5
-
-
 def test_a_chart_for_each_camera(tmp_path: Path) -> None:
     stage = capture(tmp_path / "stage")
     for number, matrix in enumerate((CAMERA, np.eye(3))):
@@ -144,24 +131,7 @@ def test_a_chart_for_each_camera(tmp_path: Path) -> None:
         < 1e-6
     )
     assert correct_colours((), "C0", seen) is seen
-    refused(UsageError, "corners of 1 image, and --colour-chart", next, read_charts(stage, name, [CORNERS]))
-    write_chart_overlays(replace(stage, charts=charts), tmp_path / "out")
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
-        "colour_chart_C0.png",
-        "colour_chart_C1.png",
-    ]
-
-
-def test_the_overlay_shows_published_colours_in_corrected_ones(tmp_path: Path) -> None:
-    image = chart_image(matrix=CAMERA)
-    chart = correction(tmp_path, image)
-    write_chart_overlays(replace(capture(tmp_path), charts=(chart,)), tmp_path)
-    shown = read_image(tmp_path / "colour_chart.png").pixels
-    assert shown.shape == (*SHAPE, 3)
-    x, y = squares_px(CORNERS)[6].mean(0).astype(int)
-    orange = shown[y - 6 : y + 6, x - 6 : x + 6]  # the published colour within what was sampled
-    assert np.abs(orange - published_colours()[6]).max() < 0.05
-    assert json.dumps(chart.record) and "max" in chart.in_words() and "\n" not in chart.in_words()
+    refused(UsageError, "corners of 1 image ... --colour-chart", next, read_charts(stage, name, [CORNERS]))
 
 
 DIM, FACE = 0.0005, data.astronaut()[:240, 60:390].astype(np.float32) / 255
@@ -172,9 +142,9 @@ REFUSED: dict[str, tuple[np.ndarray, np.ndarray, str]] = {
     "a face": (FACE, CORNERS, "delta E"),
     "too dark": (chart_image(exposure=DIM), CORNERS, "delta E"),
     "encoded": (linear_to_srgb(chart_image().clip(0, 1)), CORNERS, "lin_rec709"),
-    "small": (chart_image(CORNERS / 8, (60, 80), noise=0.0), CORNERS / 8, "pixels in its middle"),
     "outside": (chart_image(), CORNERS + np.array([90, 0]), "outside its 330 x 240"),
     "crossed": (chart_image(), CORNERS[[0, 2, 1, 3]], "delta E"),
+    "turned": (chart_image(), np.roll(CORNERS, 1, 0), "clockwise from dark skin"),
 }
 
 
@@ -184,19 +154,13 @@ def test_what_is_implausible_is_refused_in_a_line(tmp_path: Path, name: str) -> 
     refused(InputError, f"chart.exr: ... {said}", correction, tmp_path, image, corners_px)
 
 
-def test_a_white_is_clipped_of_eight_bits_and_not_of_floats(tmp_path: Path) -> None:
-    write_display(tmp_path / "chart.png", chart_image(exposure=1.3))
+def test_white_is_clipped_in_eight_bits_but_not_in_floats(tmp_path: Path) -> None:
+    write_display(tmp_path / "chart.png", chart_image(exposure=1.5))
     stage = capture(tmp_path, colour_space="sRGB", black_level=0.0)
-    refused(
-        InputError, "patches are clipped", next, read_charts(stage, str(tmp_path / "chart.png"), [CORNERS])
-    )
+    charts = read_charts(stage, str(tmp_path / "chart.png"), [CORNERS])
+    refused(InputError, "patch is clipped", next, charts)
     write_display(tmp_path / "chart.png", chart_image(matrix=CAMERA, exposure=0.8))
     chart = next(read_charts(stage, str(tmp_path / "chart.png"), [CORNERS]))
     np.testing.assert_allclose(chart.record["matrix"], kept_luminance(CAMERA), atol=0.03)
     image = chart_image(noise=0.0)
-    assert (
-        correction(tmp_path, image * np.float32((1 - LEVEL) / image.max())).record["delta_e_2000"]["after"][
-            "mean"
-        ]
-        < 0.5
-    )
+    assert delta_e(correction(tmp_path, image * np.float32((1 - LEVEL) / image.max()))) < 0.5

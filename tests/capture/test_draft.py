@@ -51,7 +51,6 @@ def test_the_draft_has_what_files_say_and_null_for_the_rest(tmp_path: Path) -> N
     sizes = [(camera["id"], camera["width"], camera["height"]) for camera in stage["cameras"]]
     assert sizes == [("cam0", 8, 6), ("cam1", 9, 6)] and stage["colour_space"] is None
     assert all(camera["world_to_camera"] is camera["K"] is None for camera in stage["cameras"])
-    assert noted(stage, "direction of 4 of 4 lights") and noted(stage, "world_to_camera of 2 of 2 cameras")
     assert noted(stage, "2 subjects, 2 cameras, 4 lights; all 16 frames exist") and "subjects" not in stage
 
 
@@ -104,7 +103,6 @@ def test_a_pattern_may_repeat_the_subject(tmp_path: Path) -> None:
     directions = {light["id"]: light["direction"] for light in stage["lights"]}
     assert directions == {"A+000E+45": None, "A+030E+00": [0.5, 0, 0.866025], "A-030E+00": None}
     assert stage["ambient"] == "{subject}/{subject}_P00_Ambient.png"
-    assert noted(stage, "fill in: direction of 2 of 3 lights")
     for light in stage["lights"]:
         light["direction"] = [0, 0, 1]
     stage["cameras"][0]["K"], stage["colour_space"] = K, "sRGB"
@@ -129,7 +127,7 @@ def test_faults_of_the_files_are_noted(tmp_path: Path) -> None:
     image(folder / "s1/cam0/all_on.exr")
     image(folder / "s1/chart.exr")
     stage = draft_stage(folder, SUFFIXES, "{subject}/{camera}/{light}.exr")
-    assert noted(stage, "1 of 16 frames are missing") and noted(stage, "width of 1 of 2 cameras")
+    assert noted(stage, "1 of 16 frames are missing") and stage["cameras"][0]["width"] is None
     assert noted(stage, "1 image that do not match the pattern") and noted(stage, "s1/chart.exr")
     assert not noted(stage, "all_on")
 
@@ -144,7 +142,7 @@ def test_links_odd_names_and_pipes(tmp_path: Path) -> None:
     os.mkfifo(folder / "lights.txt")
     os.mkfifo(folder / "s1/cam0/L4.exr")
     stage = draft_stage(folder, SUFFIXES, FOLDERS)
-    assert noted(stage, "3 subjects, 1 camera") and noted(stage, "ids not of letters")
+    assert noted(stage, "3 subjects, 1 camera") and noted(stage, "ids with other characters")
     assert all(note.isprintable() for note in stage["draft"])
 
 

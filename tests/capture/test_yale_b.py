@@ -8,7 +8,7 @@ import pytest
 
 from facerf_cli.capture.layouts import read_capture
 from facerf_cli.capture.settings import ReadSettings
-from facerf_cli.capture.yale_b import UNMARKED_DAMAGE, Flash, YaleB, guess_camera, read_shifts, read_yale_b
+from facerf_cli.capture.yale_b import UNMARKED_DAMAGE, Flash, YaleB, read_shifts, read_yale_b
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.errors import InputError
 from facerf_cli.files.write import write_exr
@@ -35,13 +35,13 @@ def test_other_names_are_no_flashes(name: str) -> None:
     assert Flash.named(name) is None
 
 
-def test_azimuth_has_the_opposite_sign_and_a_face_fills_the_image_at_a_metre() -> None:
+def test_azimuth_has_the_opposite_sign_and_a_face_fills_the_image_at_a_metre(folder: Path) -> None:
     flash = Flash(35, -20)  # from the viewer's left and below
     assert flash.direction[0] < 0 and flash.direction[1] < 0 < flash.direction[2]
     np.testing.assert_allclose(flash.direction, azel_to_direction(-35.0, -20.0).numpy(), atol=1e-6)
     np.testing.assert_allclose(Flash(0, 90).direction, [0, 1, 0], atol=1e-12)
     assert Flash(-60, 0).angle_deg == pytest.approx(60)
-    camera = guess_camera()
+    camera = read_capture(folder, ReadSettings("extended-yale-b")).cameras["P00"]
     across_px = 0.089 * camera.focal_px[0]  # the outer corners of the eyes, a metre away
     assert 0.4 * camera.width_px < across_px < 0.6 * camera.width_px
 
@@ -64,7 +64,7 @@ def test_damaged_images_are_left_out_and_counted(folder: Path) -> None:
     assert database.left_out == ["yaleB05_P00A+035E+40"]  # known to be two fields in one
     assert Flash(35, 40) not in database.flashes("yaleB05") and Flash(35, 40) in database.flashes("yaleB07")
     assert Flash(35, 40) in read_yale_b(folder, leave_out={}).flashes("yaleB05")
-    refused(InputError, "yaleB05: no sound image under A+035E+40", database.image, "yaleB05", Flash(35, 40))
+    refused(InputError, "yaleB05: no image under A+035E+40", database.image, "yaleB05", Flash(35, 40))
     assert sum(map(len, UNMARKED_DAMAGE.values())) == 16
 
 

@@ -188,7 +188,7 @@ def test_one_table_of_facerf_an_own_network_and_a_folder(
     save_networks(own, {"reflectance": network}, {"layout_version": LAYOUT_VERSION})
     del checkpoint._CLASSES["reflectance", OWN_NETWORK]
     line = ["--reflectance", "field", "--against", own, "--method", f"mean={theirs}", "-o", out]
-    assert run("compare", frozen, *line) == 1 and "give --form" in capsys.readouterr().err
+    assert run("compare", frozen, *line) == 1 and "--form" in capsys.readouterr().err
     assert run("compare", frozen, *line, "--form", OWN_NETWORK) == 0
     found = json.loads((out / "summary.json").read_text())
     assert found["methods"] == ["field", "own", "mean"] and found["pictures"] == len(listed)

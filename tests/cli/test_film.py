@@ -396,7 +396,7 @@ def test_alpha_of_a_film_is_kept(given: Path, tmp_path: Path, capsys: Said) -> N
     np.testing.assert_allclose(found, clear, atol=1)
     capsys.readouterr()
     assert facerf(given, *line, "-o", tmp_path / "out.mp4") == 0
-    assert "cut.mov over black; give FILE.mov for alpha" in capsys.readouterr().err
+    assert "over black; use FILE.mov for alpha" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["plates", "shot.mov"])

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from facerf_cli.capture.layouts import read_capture
-from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_exr
 from facerf_cli.main import main
 from tests.capture.chart_image import CAMERA, CORNERS, chart_image, kept_luminance
@@ -80,8 +79,6 @@ def test_what_was_done_is_told(wrong: Path, corrected: Path, tmp_path: Path, cap
     )
     np.testing.assert_allclose(chart["matrix"], kept_luminance(CAMERA), atol=0.02)
     assert chart["delta_e_2000"]["after"]["mean"] < 0.5 < 5 < chart["delta_e_2000"]["before"]["mean"]
-    assert read_image(corrected / chart["overlay"]).pixels.max() > 0.5
-    assert f'src="{chart["overlay"]}"' in (corrected / "index.html").read_text()
     line = ["--colour-chart", str(wrong / "chart.exr"), *PLACE, "--dry-run"]
     assert prepare(wrong, tmp_path / "out", *SPLIT, *line) == 0
     said = capsys.readouterr().err
@@ -101,13 +98,12 @@ def test_jobs_and_a_second_run(wrong: Path, corrected: Path, tmp_path: Path, cap
         assert "other stage values; pass --overwrite" in capsys.readouterr().err and tree(corrected) == before
 
 
-def test_an_older_charts_image_does_not_outlive_its_dataset_and_a_file_is_none(
+def test_an_older_correction_does_not_outlive_its_dataset_and_a_file_is_none(
     wrong: Path, corrected: Path, tmp_path: Path, capsys: Said
 ) -> None:
     shutil.copytree(corrected, tmp_path / "again")
     assert prepare(wrong, tmp_path / "again", *SPLIT, "--overwrite", "always") == 0
     assert "colour_charts" not in normalisation(tmp_path / "again")
-    assert (corrected / "colour_chart.png").is_file() and not (tmp_path / "again/colour_chart.png").exists()
     (tmp_path / "file").touch()
     assert prepare(wrong, tmp_path / "file", *SPLIT, "--colour-chart", str(wrong / "chart.exr"), *PLACE) == 2
     assert "file: cannot be written to" in capsys.readouterr().err
@@ -123,7 +119,7 @@ def test_an_older_charts_image_does_not_outlive_its_dataset_and_a_file_is_none(
         (["--colour-chart", "chart.exr", "--chart-corners", "0,0 900,0 900,9 0,9"], "outside its 330 x 240"),
         (["--colour-chart", "0000/C0/L000.exr"], "pass the image and its chart's corners"),
         (["--chart-corners", "1,2 3,4 5,6 7,8"], "pass the image and its chart's corners"),
-        (["--colour-chart", "{camera}.exr", *PLACE], "corners of 1 image, and --colour-chart names 3"),
+        (["--colour-chart", "{camera}.exr", *PLACE], "--colour-chart names 3"),
     ],
 )
 def test_wrong_charts_stop_the_run(

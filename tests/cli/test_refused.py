@@ -145,7 +145,7 @@ WRONG: dict[str, dict[str, str]] = {
         "--split 300/10/40": "the capture has 2",
         "--split half": "--split",
         "--crop 97": "--crop",
-        "--layout multipie": "there is extended-yale-b, faceolat, faceolat-linear, stage",
+        "--layout multipie": "extended-yale-b, faceolat, faceolat-linear, stage",
         "--checks only --shard 1/2": "--shard: --checks only checks all subjects; use --jobs or --ray",
         "--pattern x": "--pattern requires --describe",
     },
@@ -157,7 +157,7 @@ WRONG: dict[str, dict[str, str]] = {
         "--envmaps nowhere": "--envmaps nowhere: no such folder",
     },
     "train": {
-        "--form cubist": "form cubist: no such Reflectance Network; give one of default, paper",
+        "--form cubist": "form cubist: ... default, paper",
         "--dataset d --heads 20": "--heads: ... use one",
         "--dataset d --heads-from builtin": "--heads-from: ... use one",
         "--texture-size 64": "--texture-size: ... add --dataset",
@@ -173,8 +173,8 @@ WRONG: dict[str, dict[str, str]] = {
         "--geometry landmarks": "--geometry: does not apply to the stage reflectance",
         "--preset paper --dataset d --vgg-weights v --appearance-features a": "use one of them",
         "--preset paper --dataset data": "--vgg-weights imagenet ... --light-features FILE",
-        f"--checkpoint {SHIPPED['parsing']}": "holds a Parsing Network ... uses no network",
-        f"--checkpoint {SHIPPED['portrait']}": "holds a Portrait Network ... uses no network",
+        f"--checkpoint {SHIPPED['parsing']}": "Parsing Network ... uses no network",
+        f"--checkpoint {SHIPPED['portrait']}": "Portrait Network ... uses no network",
         "--heads 13": "--heads 13: the mean face and 12 heads are held out; use more",
         "--stage parsing --preset tiny --heads 4": "4 people are held out; use more",
         **{

@@ -78,9 +78,9 @@ def test_a_network_of_the_stage_diffuse_sh_is_taken_where_its_model_is_asked_for
     capsys.readouterr()
     assert relight("field", tmp_path / "mine.safetensors") == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "mine.safetensors: holds a network of diffuse-sh, but" in line
+    assert "mine.safetensors: contains network of diffuse-sh" in line
     assert relight("other", SHIPPED["light_features"], "--reflectance", "diffuse-sh") == 2
-    assert "holds a network S_f, but" in capsys.readouterr().err
+    assert "contains network S_f" in capsys.readouterr().err
 
 
 def test_the_portrait_is_the_default(given: Path, tmp_path: Path) -> None:

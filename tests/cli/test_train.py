@@ -174,7 +174,7 @@ def test_own_networks_and_losses_of_an_installed_package(
     relight += ["--checkpoint", str(tmp_path / "run/last.safetensors"), "--reflectance", "field"]
     capsys.readouterr()
     assert main(relight) == 1
-    assert "its network is my_lab.networks:Darker, code of your own; give --form" in capsys.readouterr().err
+    assert "--form my_lab.networks:Darker" in capsys.readouterr().err
     assert main([*relight, *own]) == 0
     assert main([*line, "-o", str(tmp_path / "other"), "--objective", "my_lab.networks:Darker"]) == 2
     assert "not a subclass of facerf_cli.training.texture:TextureObjective" in capsys.readouterr().err

@@ -7,8 +7,14 @@ import pytest
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.network import checkpoint
-from facerf_cli.network.checkpoint import form_of, load_networks, new_network, save_networks, use_form
-from facerf_cli.network.installed import installed
+from facerf_cli.network.checkpoint import (
+    form_of,
+    installed_class,
+    load_networks,
+    new_network,
+    save_networks,
+    use_form,
+)
 from tests.own_package import FORMS, NAME, write_own_package
 from tests.refusals import refused
 
@@ -28,10 +34,7 @@ def test_an_own_network_is_saved_and_needs_its_name(package: Path, tmp_path: Pat
     loaded = load_networks(path, LAYOUT_VERSION)[0]["reflectance"]
     assert type(loaded) is type(network) and type(loaded).__name__ == "Darker"
     del checkpoint._CLASSES["reflectance", NAME]
-    with pytest.raises(
-        InputError, match=f"own.safetensors: its network is {NAME}, code of your own; give --form"
-    ):
-        load_networks(path, LAYOUT_VERSION)
+    refused(InputError, f"own.safetensors: ... --form {NAME}", load_networks, path, LAYOUT_VERSION)
 
 
 def test_a_class_that_extends_a_form_is_made_like_it(package: Path) -> None:
@@ -44,9 +47,9 @@ def test_a_class_that_extends_a_form_is_made_like_it(package: Path) -> None:
 def test_what_is_not_installed_is_one_line(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         patch.chdir(package)  # nothing comes from the working directory
-        refused(UsageError, "install the package that has it", installed, "my_lab.networks:Darker", "--form")
+        refused(UsageError, "install its package", installed_class, "my_lab.networks:Darker", "--form")
     for name in ("my_lab.networks:Nobody", "nobody.networks:Darker", "my_lab.networks:number"):
-        refused(UsageError, f"--objective {name}: ", installed, name, "--objective")
+        refused(UsageError, f"--objective {name}: ", installed_class, name, "--objective")
 
 
 def test_facerfs_own_forms_import_nothing() -> None:

@@ -63,9 +63,4 @@ def test_every_weight_takes_part(network: ParsingNetwork) -> None:
 def test_a_network_of_other_classes_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.safetensors"
     save_networks(path, {"parsing": ParsingNetwork(SMALL)}, {"layout_version": LAYOUT_VERSION})
-    refused(
-        InputError,
-        "a.safetensors: ... --stage parsing",
-        load_models([path]).networks.load,
-        ["parsing"],
-    )
+    refused(InputError, "Parsing Network of this version", load_models([path]).networks.load, ["parsing"])

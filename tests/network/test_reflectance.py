@@ -8,9 +8,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from facerf_cli.errors import UsageError
-from facerf_cli.network.checkpoint import new_network
+from facerf_cli.network.checkpoint import REFLECTANCE_FORMS, new_network
 from facerf_cli.network.inputs import to_root
-from facerf_cli.network.reflectance import REFLECTANCE_FORMS, ReflectanceNetwork
+from facerf_cli.network.reflectance import ReflectanceNetwork
 
 SMALL: dict[str, dict[str, Any]] = {  # settings of a test's network, where a small side is not enough
     "default": {"side": 32, "encoder_widths": [8, 12], "decoder_widths": [8, 12], "rig_lights": 5},
@@ -86,7 +86,7 @@ def test_a_form_by_its_name_is_its_class_with_its_settings(network: Any) -> None
 
 def test_unknown_forms_and_settings_are_refused() -> None:
     forms = ", ".join(REFLECTANCE_FORMS)
-    with pytest.raises(UsageError, match=f"form other: no such Reflectance Network; give one of {forms}"):
+    with pytest.raises(UsageError, match=f"form other: .*{forms}"):
         new_network("reflectance", "other", {})
     with pytest.raises(TypeError):
         new_network("reflectance", "paper", {"rig_lights": 3})

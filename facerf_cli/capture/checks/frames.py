@@ -1,7 +1,7 @@
-"""Frames of a camera as the checks see them, and the faults of single frames.
+"""Frames of a camera, shrunk for the checks, and checks of single frames.
 
-A frame may be missing, unreadable, black, clipped or another camera's. Each is read
-once for all checks, and one full frame is in memory at a time.
+A frame may be missing, unreadable, black, clipped or another camera's. Each is read once for all checks, and
+one full frame is in memory at a time.
 """
 
 import hashlib
@@ -24,25 +24,19 @@ _FLAT = 1e-6  # of a frame's maximum
 _CLIPPED_SHARE = 0.01  # of the pixels: highlights on skin are smaller, a clipped cheek is larger
 _CEILING = 1e-4  # relative distance within which values count as the ceiling
 # Lights that head, body, hair or brows can hide from the face, in camera space.
-_BEHIND = -0.5  # cosine to the camera's axis: the head hides lights further behind
-_BELOW = -0.7  # sine of the elevation: the body hides lights further below
+_BEHIND = -0.5  # cosine to the camera's axis; the head hides lights below it
+_BELOW = -0.7  # sine of the elevation; the body hides lights below it
 _ABOVE, _OVERHEAD = 0.85, 0.3  # sine above which hair or brows hide lights of a cosine below the second
 
 
-# Measurements of a full-size frame with recorded values, not divided by the light's intensity.
-_MEASURED = np.dtype(
-    [
-        ("digest", "U64"),  # SHA-256 of the pixels
-        ("highest", float),  # largest value
-        ("share_highest", float),  # of the pixels with the largest value in some channel
-        ("spread", float),  # largest less smallest value
-    ]
-)
+# Measurements of a full-size frame with recorded values, not divided by the light's intensity: SHA-256 of its
+# pixels, largest value, fraction of pixels that have it in some channel, largest less smallest value.
+_MEASURED = np.dtype([("digest", "U64"), ("highest", float), ("share_highest", float), ("spread", float)])
 
 
 @dataclass(frozen=True, eq=False)
 class CameraFrames:
-    """The readable frames of a subject in a camera, small and grey."""
+    """Readable frames of a subject in a camera, small and grey."""
 
     subject: str
     camera: str
@@ -65,7 +59,7 @@ class CameraFrames:
 
     def error(self, check: str, words: str, row: int | None = None, **figures: float) -> Finding:
         """Make an error about the camera, or about the frame in a row, which is then left out."""
-        light = "" if row is None else self.light_ids[row]
+        light = None if row is None else self.light_ids[row]
         return Finding("error", check, self.subject, words, self.camera, light, figures)
 
     def warning(self, check: str, words: str, **figures: float) -> Finding:
@@ -76,7 +70,7 @@ class CameraFrames:
 def read_frames(
     capture: Capture, subject: str, camera: str, side_px: int
 ) -> tuple[CameraFrames, dict[str, InputError]]:
-    """Read the frames of a camera that exist, shrunk to `side_px`; return the errors of others by light."""
+    """Read the existing frames of a camera, shrunk to `side_px`; return unreadable ones' errors by light."""
     posed = capture.cameras[camera]
     scale = max(posed.width_px, posed.height_px, side_px) / side_px
     size = (max(round(posed.height_px / scale), 1), max(round(posed.width_px / scale), 1))
@@ -91,8 +85,9 @@ def read_frames(
             continue
         places.append(place)
         measured.append(_measure(pixels * capture.intensities[place].astype(np.float32)))
-        grey = torch.from_numpy(_grey_of(pixels))[None, None]
-        greys.append(F.interpolate(grey, size, mode="area")[0, 0].numpy())
+        red, green, blue = np.moveaxis(pixels, -1, 0)
+        grey = (red + green + blue) / np.float32(3)  # many times faster than the mean over an axis of three
+        greys.append(F.interpolate(torch.from_numpy(grey)[None, None], size, mode="area")[0, 0].numpy())
     frames = CameraFrames(
         subject=subject,
         camera=camera,
@@ -105,13 +100,7 @@ def read_frames(
     return frames, unread
 
 
-def _grey_of(pixels: np.ndarray) -> np.ndarray:
-    """Mean of the channels [H, W]; numpy's mean is many times slower over an axis of three."""
-    return (pixels[..., 0] + pixels[..., 1] + pixels[..., 2]) / np.float32(3)
-
-
 def _measure(pixels: np.ndarray) -> tuple[str | float, ...]:
-    """Measure a frame [H, W, 3] at full size."""
     highest = float(pixels.max())
     top = (pixels >= highest * _AT_THE_TOP).any(-1) if highest > 0 else np.zeros(1)
     digest = hashlib.sha256(pixels.tobytes()).hexdigest()
@@ -119,7 +108,7 @@ def _measure(pixels: np.ndarray) -> tuple[str | float, ...]:
 
 
 def reaches_face(directions: np.ndarray) -> np.ndarray:
-    """Mask [L] of directions [L, 3], camera space, that neither head, hair nor body hides from the face."""
+    """Return the mask [L] of directions [L, 3] in camera space that no head, hair or body blocks."""
     _, up, front = directions.T
     return (front > _BEHIND) & (up > _BELOW) & ~((up > _ABOVE) & (front < _OVERHEAD))
 
@@ -138,12 +127,12 @@ def check_missing(capture: Capture, subject: str, camera: str) -> Iterator[Findi
         yield Finding("error", "missing", subject, f"{paths[light]}: no such file; copy it", camera, light)
     if extra := extra_names(capture, subject, camera):
         names = ", ".join(extra[:_LISTED]) + (", ..." if len(extra) > _LISTED else "")
-        words = f"{len(extra)} files are of no light in the list ({names}); list their lights, or remove them"
+        words = f"{len(extra)} files belong to no light ({names}); list their lights, or remove them"
         yield Finding("warning", "extra", subject, words, camera, figures={"files": len(extra)})
 
 
 def extra_names(capture: Capture, subject: str, camera: str) -> list[str]:
-    """Names in the light's place of files that are of no light, sorted; without full and ambient images."""
+    """Return the sorted names in the light's place that belong to no light, to a full or an ambient image."""
     mark = "\x01"  # occurs in no name
     path = capture.frame_path(subject, camera, mark)
     if path.name.count(mark) != 1 or mark in str(path.parent):  # {light} is a folder's name, or stands twice
@@ -157,7 +146,7 @@ def extra_names(capture: Capture, subject: str, camera: str) -> list[str]:
 
 
 def check_readable(frames: CameraFrames, unread: Mapping[str, InputError]) -> Iterator[Finding]:
-    """Report each unreadable frame; or the camera, where most frames have another size."""
+    """Report each unreadable frame, or the camera if most frames have another size."""
     sizes = {light: error for light, error in unread.items() if isinstance(error, FrameSizeError)}
     camera_is_wrong = len(sizes) > _MOST_OF_ANOTHER_SIZE * (len(unread) + len(frames.light_ids))
     if camera_is_wrong:
@@ -173,10 +162,10 @@ def check_readable(frames: CameraFrames, unread: Mapping[str, InputError]) -> It
 
 
 def check_black(frames: CameraFrames) -> Iterator[Finding]:
-    """Report each frame that is black or has one value throughout; or the camera, if most are black.
+    """Report each frame that is black or has one value throughout, or the camera if most are black.
 
-    A light behind the head may reach nothing that the camera sees. So a dark frame counts as black only under
-    a light that reaches the face; a frame of one value is broken under any light.
+    A light behind the head may reach nothing visible. So a dark frame counts as black only if its light
+    reaches the face; a frame with one value is broken under any light.
     """
     highest, spread = frames.measured["highest"], frames.measured["spread"]
     usual = float(np.median(highest)) if len(highest) else 1.0
@@ -191,7 +180,7 @@ def check_black(frames: CameraFrames) -> Iterator[Finding]:
 
 
 def check_clipped(frames: CameraFrames) -> Iterator[Finding]:
-    """Warn once per camera of frames with large areas at the sensor's ceiling.
+    """Warn once per camera about frames with large areas at the sensor's ceiling.
 
     The ceiling is the largest value of all frames, if two or more frames reach it: noise and highlights
     differ from frame to frame, a clipped sensor does not. EXR files declare no ceiling.
@@ -210,7 +199,7 @@ def check_clipped(frames: CameraFrames) -> Iterator[Finding]:
 
 
 def same_frames(frames: CameraFrames) -> list[list[int]]:
-    """Groups of rows with identical images, among frames that have more than one value."""
+    """Return groups of rows with identical images, among frames that have more than one value."""
     groups: dict[str, list[int]] = {}
     for row in np.flatnonzero(frames.measured["spread"] > 0).tolist():
         groups.setdefault(frames.measured["digest"][row], []).append(row)
@@ -218,7 +207,7 @@ def same_frames(frames: CameraFrames) -> list[list[int]]:
 
 
 def check_other_cameras(frames: CameraFrames, earlier: Mapping[str, str]) -> Iterator[Finding]:
-    """Report a camera with frames of another one; `earlier` has the others' camera/light by digest."""
+    """Report a camera with frames of another one; `earlier` maps digests to the others' camera/light."""
     rows = np.flatnonzero(frames.measured["spread"] > 0)
     again = [row for row in rows if frames.measured["digest"][row] in earlier]
     if again:

@@ -1,8 +1,8 @@
-"""The check of head motion between frames.
+"""Check of head motion between frames.
 
-Each frame is registered with its prediction by photometric stereo, which has the same lighting: on the
-orientation of their gradients alone (G. Tzimiropoulos et al., *Robust FFT-based scale-invariant image
-registration with image gradients*, PAMI 2010), so that remaining shading errors count little.
+Each frame is registered with its prediction by photometric stereo, which has the same lighting. Only the
+orientation of their gradients counts (G. Tzimiropoulos et al., *Robust FFT-based scale-invariant image
+registration with image gradients*, PAMI 2010), so that remaining shading errors have little influence.
 """
 
 from collections.abc import Iterator
@@ -14,17 +14,17 @@ from facerf_cli.capture.checks.frames import CameraFrames
 from facerf_cli.capture.checks.shading import Stereo
 from facerf_cli.capture.findings import Finding
 
-# Pixels here are those of the small frames.
+# Pixels of the small frames.
 _SMOOTH_PX = 1.0
 _REACH_PX = 8  # largest offset that is searched
-_LEAST_PEAK = 0.5  # of a perfect match: below it, the frame's own shadows dominate
+_LEAST_PEAK = 0.5  # of a perfect match; below it, the frame's own shadows dominate
 _IN_FRONT = 0.3  # cosine of light and camera axis: other lights leave most of the face dark
 _MOVED_PX = 1.0  # synthetic frames without motion are off by 0.2 in the median and by 0.5 at most
 _LEAST_GAIN = 0.1  # of a perfect match: least gain of an offset beyond `_MOVED_PX`
 
 
 def check_motion(frames: CameraFrames, stereo: Stereo) -> Iterator[Finding]:
-    """Warn once per camera with frames in which the head has moved."""
+    """Warn once per camera if the head has moved between frames."""
     moved_px, trusted = measure_motion(frames, stereo)
     far = np.hypot(*moved_px.T)
     moved = far > _MOVED_PX
@@ -41,9 +41,9 @@ def check_motion(frames: CameraFrames, stereo: Stereo) -> Iterator[Finding]:
 
 
 def measure_motion(frames: CameraFrames, stereo: Stereo) -> tuple[np.ndarray, np.ndarray]:
-    """Measure the frames of lights in front against their predictions.
+    """Register the frames of lights in front with their predictions.
 
-    Returns the offsets [L, 2], down and right, in pixels, and whether they can be trusted [L]; others are 0.
+    Returns the offsets [L, 2], down and right, in pixels, and which are reliable [L]; the others are 0.
     """
     predicted = np.zeros(frames.grey.shape)
     predicted[:, stereo.lit] = stereo.predicted(frames.directions)
@@ -58,7 +58,7 @@ def measure_motion(frames: CameraFrames, stereo: Stereo) -> tuple[np.ndarray, np
 
 
 def orientation(image: np.ndarray) -> np.ndarray:
-    """Gradients [h, w] as complex numbers, of length about 1 where strong, shorter in noise."""
+    """Return gradients [h, w] as complex numbers; their length is about 1, and less in noise."""
     image = image.astype(float)
     right = ndimage.gaussian_filter(image, _SMOOTH_PX, order=(0, 1))
     down = ndimage.gaussian_filter(image, _SMOOTH_PX, order=(1, 0))
@@ -67,7 +67,7 @@ def orientation(image: np.ndarray) -> np.ndarray:
 
 
 def register(moved: np.ndarray, still: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """Register one orientation field [h, w] with another by their correlation.
+    """Register an orientation field [h, w] with another by their correlation.
 
     Returns the offset [2] (down, right), the match there in 0..1, and its gain over the match without offset.
     """
@@ -85,7 +85,7 @@ def register(moved: np.ndarray, still: np.ndarray) -> tuple[np.ndarray, float, f
 
 
 def peak(values: np.ndarray, place: int) -> float:
-    """Refine the place of a maximum of values [N] by a parabola through its neighbours; an end stays."""
+    """Refine the index of a maximum of values [N] by a parabola, except at the ends."""
     if not 0 < place < len(values) - 1:
         return float(place)
     before, here, after = values[place - 1 : place + 2].tolist()

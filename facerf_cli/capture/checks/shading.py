@@ -1,4 +1,4 @@
-"""Checks by shading: photometric stereo of a camera's frames, and what contradicts it.
+"""Checks of shading: photometric stereo of a camera's frames, and frames that contradict it.
 
 R. Woodham, *Photometric method for determining surface orientation from multiple images*, Optical Engineering
 1980: under a light from direction d a matte surface has radiance g . d, where g is its normal times its
@@ -6,8 +6,8 @@ albedo. A constant per pixel is fitted too, for the light of the room. The fit i
 highlights and broken frames: weights fall with the residual, and frames under lights behind a pixel do not
 count.
 
-**Order.** The direction of a frame's light is solved for on the fitted normals, for lights in front of the
-face; others reach only edges and hair.
+**Order.** The fitted normals determine the direction of a frame's light, for lights in front of the face;
+others reach only edges and hair.
 
 **Rig.** Lights mirrored or turned as a whole, or swapped cameras, leave frames consistent with each other,
 but turn the fitted normals. The visible side of any object faces the camera: normals lean to the right on its
@@ -46,14 +46,14 @@ _LEAN = 0.3  # correlation of a normal's x with the pixel's x, negative for mirr
 
 @dataclass(frozen=True, eq=False)
 class Stereo:
-    """Shape and albedo of the P pixels that `lit` covers."""
+    """Shape and albedo of the P pixels in `lit`."""
 
     g: np.ndarray  # [P, 3] normal times albedo, camera space
     room: np.ndarray  # [P] constant light of the room, not negative
     lit: np.ndarray  # [h, w] bool
 
     def predicted(self, directions: np.ndarray) -> np.ndarray:
-        """Predicted frames [L, P] under lights from directions [L, 3], without cast shadows."""
+        """Predict frames [L, P] under lights from directions [L, 3], without cast shadows."""
         return np.maximum(directions @ self.g.T, 0) + self.room
 
     @property
@@ -63,7 +63,7 @@ class Stereo:
 
 
 def fit_stereo(frames: CameraFrames) -> Stereo | None:
-    """Fit the frames of a camera; None where there are too few frames or lit pixels."""
+    """Fit the frames of a camera; return None if there are too few frames or lit pixels."""
     lit = lit_pixels(frames.grey) if len(frames.light_ids) >= _LEAST_FRAMES else np.zeros((1, 1), bool)
     if lit.sum() < _LEAST_LIT_PX:
         return None
@@ -71,7 +71,7 @@ def fit_stereo(frames: CameraFrames) -> Stereo | None:
 
 
 def lit_pixels(grey: np.ndarray) -> np.ndarray:
-    """Mask [h, w] of the object in frames [L, h, w], without the dark background."""
+    """Return the mask [h, w] of the object in frames [L, h, w], without the dark background."""
     bright = np.percentile(grey, 90, axis=0)
     return bright > _LIT_SHARE * np.percentile(bright, 95)
 
@@ -94,14 +94,14 @@ def photometric_stereo(values: np.ndarray, directions: np.ndarray, lit: np.ndarr
 
 
 def angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angles between unit vectors [..., 3], in degrees."""
+    """Return the angles between unit vectors [..., 3], in degrees."""
     return np.degrees(np.arccos(np.clip((a * b).sum(-1), -1, 1)))
 
 
 def check_duplicates(frames: CameraFrames, stereo: Stereo | None) -> Iterator[Finding]:
-    """Report identical frames, except the one of each group whose light predicts the image best.
+    """Report identical frames, except the frame of each group whose light predicts the image best.
 
-    `stereo` is fitted without these frames; if it is None, whole groups are reported.
+    `stereo` must be fitted without these frames; if it is None, whole groups are reported.
     """
     for rows in same_frames(frames):
         words = f"is identical to other frames ({', '.join(frames.light_ids[row] for row in rows)})"
@@ -120,8 +120,8 @@ def check_frames_order(frames: CameraFrames, stereo: Stereo) -> Iterator[Finding
     rows = np.flatnonzero((frames.directions[:, 2] > _IN_FRONT) & (frames.directions[:, 1] > _BELOW))
     if len(rows) < 4:
         return
-    found = np.stack([solve_light(frames.grey[row][stereo.lit], stereo) for row in rows])
-    off_deg = angle_deg(found, frames.directions[rows])
+    solved = np.stack([solve_light(frames.grey[row][stereo.lit], stereo) for row in rows])
+    off_deg = angle_deg(solved, frames.directions[rows])
     wrong = np.flatnonzero(off_deg > _OFF_DEG)
     if len(wrong) > max(_MOST_SWAPPED * len(rows), 2):
         words = (
@@ -132,7 +132,7 @@ def check_frames_order(frames: CameraFrames, stereo: Stereo) -> Iterator[Finding
         yield frames.error("order", words, frames=len(wrong), median_off_deg=off)
         return
     for place in wrong.tolist():
-        like = frames.light_ids[int(np.argmax(frames.directions @ found[place]))]
+        like = frames.light_ids[int(np.argmax(frames.directions @ solved[place]))]
         words = (
             f"is lit from {off_deg[place]:.0f} degrees off its light's direction, as under {like}; correct "
             "the file's name, or check whether the light fired"
@@ -157,16 +157,16 @@ def solve_light(image: np.ndarray, stereo: Stereo) -> np.ndarray:
 
 @dataclass(frozen=True)
 class RigFit:
-    """The object's normals under the declared lights, as a camera sees them."""
+    """Mean normal of the object under the declared lights, in a camera's space."""
 
-    camera: str
-    mirrored: bool  # they lean to the left on the object's right side
+    camera: str | None
+    mirrored: bool  # normals lean to the left on the object's right side
     right_deg: float  # of the mean normal, from the camera's axis
     up_deg: float
 
     @property
     def faults(self) -> list[str]:
-        """Faults of the lights in words; empty for none."""
+        """Faults of the lights in words."""
         ways = {
             "mirrored left to right": self.mirrored,
             f"turned sideways by {self.right_deg:.0f} degrees": abs(self.right_deg) > _TURN_DEG,
@@ -191,15 +191,13 @@ def check_rigs(subject: str, rigs: Sequence[RigFit]) -> Iterator[Finding]:
         return
     half = len(rigs) / 2
     right_deg, up_deg = np.median([(rig.right_deg, rig.up_deg) for rig in rigs], axis=0).tolist()
-    of_most = RigFit("", sum(rig.mirrored for rig in rigs) > half, right_deg, up_deg)
+    of_most = RigFit(None, sum(rig.mirrored for rig in rigs) > half, right_deg, up_deg)
     what, advice = "unlike in other cameras, the lights are", "its world_to_camera, or its frames"
     if of_most.faults:
         off, what = off[:1], "the lights are"
         advice = "their directions, their names or world_to_camera"
     for rig in off:
-        words = (
-            f"{what} {' and '.join(rig.faults)} against the object that this camera sees; correct {advice}"
-        )
+        words = f"{what} {' and '.join(rig.faults)} relative to the object in this camera; correct {advice}"
         figures = {"right_deg": round(rig.right_deg, 1), "up_deg": round(rig.up_deg, 1)}
         check = "rig" if of_most.faults else "camera"
         yield Finding("error", check, subject, words, rig.camera, figures=figures)

@@ -74,7 +74,7 @@ def test_a_missing_frame_is_left_out(tmp_path: Path, sound: np.ndarray) -> None:
 def test_a_camera_without_frames_is_one_finding(tmp_path: Path, sound: np.ndarray) -> None:
     folder = write_egg_stage(tmp_path / "s", sound, cameras=[egg_camera(EGG_CAMERA), egg_camera("C1")])
     found = only(findings(folder))
-    assert (found.check, found.camera, found.light) == ("missing", "C1", "")
+    assert (found.check, found.camera, found.light) == ("missing", "C1", None)
 
 
 def test_files_of_no_lamp_are_counted_but_not_the_ambient_one(tmp_path: Path, sound: np.ndarray) -> None:
