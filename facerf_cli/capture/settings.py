@@ -29,8 +29,8 @@ class ChartSettings:
     Attributes:
         colour_chart: Image of a ColorChecker Classic under the stage's lights, used to correct the colours;
             {camera} in its name selects one image per camera.
-        chart_corners: Corners of the area of the chart's 24 patches in pixels, clockwise from the dark skin
-            patch; for several images, in the order of the cameras, separated by ;.
+        chart_corners: Corners of the chart's patches in pixels, clockwise from dark skin; one set per camera,
+            separated by ;.
     """
 
     colour_chart: str = option("", metavar="IMAGE", shown_default=False, panel=CORRECTION, everyday=True)
