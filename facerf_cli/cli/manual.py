@@ -16,7 +16,7 @@ from facerf_cli.main import app
 _EXIT_CODES = (
     ("", "0", "Everything is done."),
     ("", "1", "Some inputs failed; standard error has a line for each."),
-    ("", "2", "The command line is wrong, or there are no inputs."),
+    ("", "2", "The command line is invalid, or no input exists."),
     ("", "130", "Interrupted."),
 )
 

@@ -43,7 +43,7 @@ def view(
     work: MakePage,
     batch: Annotated[FileOrFolder, Without("name")],
 ) -> None:
-    """Make a web page in which a photo or an OLAT stack is relit by moving lights.
+    """Make a web page that relights a photo or an OLAT stack by moving lights.
 
     A folder of pages gets a list of them, index.html; -o me.html writes a single page. Each page is one file
     of about 5 MB that a browser opens without a server or network. It has single lights, rotated environment

@@ -230,7 +230,7 @@ class CasesOptions(FaceOptions):
     """Options of `evaluate cases`, which writes every image and measures none.
 
     Attributes:
-        same_pose: Write only pairs in which source and target have the same camera.
+        same_pose: Write only pairs whose source and target have the same camera.
     """
 
     same_pose: bool = option(False, flags=("--same-pose",), panel=DATA)

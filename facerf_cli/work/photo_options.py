@@ -81,7 +81,7 @@ class PhotoOptions:
             (points/{stem}.pts).
         geometry: How the face is fitted: to landmarks, or by the Geometry Network, without landmarks.
         texture_side: Side of the UV texture, a multiple of 256.
-        form: Class of your own Reflectance Network.
+        form: Class of a custom Reflectance Network.
         person: Matte of the person, a grey image or its alpha, instead of the detected one.
     """
 
