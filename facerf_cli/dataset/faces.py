@@ -25,6 +25,7 @@ from facerf_cli.network.inputs import MEAN_RADIANCE, Batch, resize
 from facerf_cli.raster.texture import inpaint, normal_map
 from facerf_cli.synth.bank.heads import HeadBakeSettings, bake_head
 from facerf_cli.synth.bank.texture_samples import CameraResponse, Sample, camera_matrix, draw_target_lights
+from facerf_cli.synth.camera import recoloured
 
 _LEAST_INSIDE = 0.9  # fraction of a texel's pixels that must lie on the face and inside the photo
 _AROUND_PX = 16  # rows read beyond the face, for texels that cross its border
@@ -82,7 +83,7 @@ class LitCrops(Batch):
     def unwrapped(self, side: int) -> LightTextures:
         """Unwrap the faces to textures of a side."""
         textures, _ = self.crops.unwrapped(side)
-        return LightTextures(_coloured(textures, self.colours), self.lights_head, self.heads)
+        return LightTextures(recoloured(textures, self.colours[:, None]), self.lights_head, self.heads)
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ class SampleCrops(Batch):
         """Unwrap the faces to textures of a side, with the sources as their cameras would see them."""
         source, visible = self.source.unwrapped(side)
         target, target_visible = self.target.unwrapped(side)
-        photo = self.response.apply(_coloured(source, self.colours)[:, 0], visible)
+        photo = self.response.apply(recoloured(source, self.colours[:, None])[:, 0], visible)
         normals = normal_map(self.source.vertices, on_device(photo.device, grid_triangles), side)
         return Sample(
             source=inpaint(photo, visible[:, 0]),
@@ -118,14 +119,9 @@ class SampleCrops(Batch):
             # the source's normals, rotated, like in `Field.olats`
             normals_target=torch.einsum("bdc,bcij->bdij", self.turn, normals),
             lights=self.lights,
-            target=_coloured(target, self.colours),
+            target=recoloured(target, self.colours[:, None]),
             weight=target_visible * (0.3 + 0.7 * visible),
         )
-
-
-def _coloured(textures: Tensor, matrices: Tensor) -> Tensor:
-    """Apply matrices [B, 3, 3] to the colours of textures [B, N, 3, T, T]."""
-    return (matrices[:, None] @ textures.flatten(3)).view(textures.shape)
 
 
 @dataclass(frozen=True, eq=False)
