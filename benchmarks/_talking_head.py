@@ -248,7 +248,7 @@ def still(clip: Clip, frames: int) -> Clip:
     return Clip(**kept)
 
 
-def filmed(clip: Clip) -> list[np.ndarray]:
+def recorded(clip: Clip) -> list[np.ndarray]:
     """Scene-linear frames [H, W, 3] with noise, in 8 bits, as a camera writes them."""
     random = np.random.default_rng(SEED)
     noisy = clip.source + random.normal(0, NOISE, clip.source.shape)

@@ -1,11 +1,11 @@
 """Flicker of a relit shot: a synthetic head that talks and turns under a fixed light, whose truth is known.
 
     python benchmarks/flicker.py [--frames 16] [--size 256] [--person 5] [--clip clip.npz] [--sheet sheet.png]
-    python benchmarks/flicker.py --film FILM|PHOTO [--frames 12]
+    python benchmarks/flicker.py --video VIDEO|PHOTO [--frames 12]
 
 Temporal error: mean |(result - truth)_t - (result - truth)_{t-1}| over the person, over the same of the
 truth, in display values (sRGB); results have one gain a channel for the whole clip. Over patches, all are
-blurred first by a Gaussian of 1/64 of the side: flicker is seen in patches, the grain of a film in pixels.
+blurred first by a Gaussian of 1/64 of the side: flicker is seen in patches, film grain in pixels.
 It counts errors that stay where they are on the head, too, since they move past the pixels with it. How many,
 tells a steady twin: the truth times the mean over time of result / truth, carried with the head by its known
 motion.
@@ -21,9 +21,9 @@ noise, and what is rough in the motion of the true light.
 The still head is one frame of the clip, with new noise in each frame: its truth does not move, so its
 temporal errors are over those of the source, which are its noise.
 
---film measures any film, without truth: the mean difference of a frame from the one before, warped by optical
-flow of the source, over the person, in steps of 255. A photo is panned and zoomed by less than a pixel a
-frame, with noise; it is no real film.
+--video measures any video, without truth: the mean difference of a frame from the one before, warped by
+optical flow of the source, over the person, in steps of 255. A photo is panned and zoomed by less than a
+pixel per frame, with noise, to stand for a video.
 """
 
 from collections.abc import Callable
@@ -31,8 +31,8 @@ from pathlib import Path
 
 import numpy as np
 from _common import arguments, print_header, print_row
-from _film_of_photo import frames_of
-from _talking_head import LIGHTS, TARGET, Clip, filmed, kept_clip, still
+from _talking_head import LIGHTS, TARGET, Clip, kept_clip, recorded, still
+from _video_of_photo import frames_of
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 from skimage.registration import optical_flow_ilk
@@ -65,7 +65,7 @@ def one_by_one(models: Models, frames: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def as_shot(models: Models, frames: list[np.ndarray]) -> list[np.ndarray]:
-    """Relight the frames as `facerf relight FILM` does."""
+    """Relight the frames as `facerf relight VIDEO` does."""
     windows = map(steady_shot(models, frames).window, range(len(frames)))
     return [relit(models, frame, one.head, one) for frame, one in zip(frames, windows, strict=True)]
 
@@ -146,7 +146,7 @@ WAYS: dict[str, Way] = {"frame by frame": one_by_one, "as a shot": as_shot}
 
 def measure(name: str, clip: Clip, models: Models) -> dict[str, np.ndarray]:
     """Print the rows of a clip; return the results in display values."""
-    frames = filmed(clip)
+    frames = recorded(clip)
     source = np.stack([shown(frame) for frame in frames])
     found = {way: exposed(relight(models, frames), clip) for way, relight in WAYS.items()}
     steady = steady_twin(found["as a shot"], clip)
@@ -187,37 +187,37 @@ def warped(image: np.ndarray, flow: np.ndarray) -> np.ndarray:
 
 
 def warped_errors(
-    films: dict[str, list[np.ndarray]], source: list[np.ndarray], mattes: list[np.ndarray]
+    videos: dict[str, list[np.ndarray]], source: list[np.ndarray], mattes: list[np.ndarray]
 ) -> dict[str, tuple[float, float]]:
     """Mean and 99 % of the difference of each frame from the one before, warped, in steps of 255.
 
     All are in display values; mattes [H, W] show the person. Left out is where the source itself differs.
     """
-    found: dict[str, list[np.ndarray]] = {name: [] for name in films}
+    found: dict[str, list[np.ndarray]] = {name: [] for name in videos}
     for n in range(1, len(source)):
         flow = flow_between(source[n - 1], source[n])
         smooth = gaussian_filter(warped(source[n - 1], flow) - source[n], (1, 1, 0))
         trusted = (np.abs(smooth).max(-1) < ALIKE) & (mattes[n] > 0.5)
-        for name, film in films.items():
-            found[name].append(np.abs(warped(film[n - 1], flow) - film[n])[trusted])
+        for name, video in videos.items():
+            found[name].append(np.abs(warped(video[n - 1], flow) - video[n])[trusted])
     every = {name: 255 * np.concatenate(parts) for name, parts in found.items()}
     return {name: (float(x.mean()), float(np.percentile(x, 99))) for name, x in every.items()}
 
 
-def measure_film(path: Path, count: int, models: Models) -> None:
-    """Print the warped errors of a film."""
+def measure_video(path: Path, count: int, models: Models) -> None:
+    """Print the warped errors of a video."""
     frames = frames_of(path, count)
     view = steady_shot(models, frames)
     mattes = [view.segmentation(n).matte for n in range(len(frames))]
     source = [shown(frame) for frame in frames]
-    films = {"the source itself": source}
+    videos = {"the source itself": source}
     for way, relight in WAYS.items():
         linear = np.stack(relight(models, frames))
         own = np.stack(mattes) > 0.5
         gain = np.stack(frames)[own].mean() / linear[own].mean()
-        films[way] = list(shown(linear * gain))
+        videos[way] = list(shown(linear * gain))
     print_header(path.name, "warped error, mean", "99 %")
-    for name, (mean, most) in warped_errors(films, source, mattes).items():
+    for name, (mean, most) in warped_errors(videos, source, mattes).items():
         print_row(name, f"{mean:.2f}", f"{most:.1f}")
 
 
@@ -227,12 +227,12 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--person", type=int, default=5)
     parser.add_argument("--clip", type=Path, help="keep the synthetic clip here; read it from here")
-    parser.add_argument("--film", type=Path)
+    parser.add_argument("--video", type=Path)
     parser.add_argument("--sheet")
     given = parser.parse_args()
     models = load_models()
-    if given.film:
-        measure_film(given.film, given.frames, models)
+    if given.video:
+        measure_video(given.video, given.frames, models)
         return
     clip = kept_clip(given.clip, given.person, given.frames, given.size)
     print_header("head", "relit", "temporal error of pixels", "of patches", "flicker, %")

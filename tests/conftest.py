@@ -25,7 +25,7 @@ SHARED = Path(os.environ.get("FACERF_SHARED", Path(__file__).parents[2] / "share
 
 # Files that take 10 s or more, the longest first: where they come first, both processes end together.
 LONG = """
-test_paper_script.py test_docs_commands.py cli/test_film.py cli/test_relight.py cli/test_train.py
+test_paper_script.py test_docs_commands.py cli/test_video.py cli/test_relight.py cli/test_train.py
 run/test_ray_workers.py viewer/test_viewer_agreement.py cli/test_predict_olat.py test_gradients.py
 cli/test_prepare_dataset.py cli/test_estimate_light.py cli/test_output_options.py cli/test_person.py
 cli/test_relight_reflectance.py cli/test_evaluate_protocols.py test_main.py cli/test_synth_stage.py

@@ -15,7 +15,7 @@ on an idle core, and 20 s more for each photo.
 `compare A B` prints a line for each file that differs, with the largest difference of its values, then the
 counts; it exits 1 on any difference. `--only` is as above. `--within X` takes differences up to X of a file's
 largest value for equal. Compared are: pixels, channels and numbers of every part of an image, frames of
-films, arrays of .npz and .safetensors, numbers of .json, .jsonl and .csv by their names (not words, nor the
+videos, arrays of .npz and .safetensors, numbers of .json, .jsonl and .csv by their names (not words, nor the
 names in TIMES), vertices of .glb and .obj, numbers of text. A page is compared by its size, within 1 %.
 """
 
@@ -40,12 +40,23 @@ TIMES = re.compile(
 )
 NUMBER = re.compile(r"(?<![\w.])-?\d+\.?\d*(?:e[-+]?\d+)?(?![\w.])", re.IGNORECASE)
 
+# Words in names of runs, files, layers and numbers: old, new. `compare` translates the names in A.
+RENAMED = {
+    "film": "video",
+    "own": "original",
+    "around": "uniform",
+    "even": "delight",
+    "room": "ambient",
+    "white": "white-balance",
+}
+OLD_WORD = re.compile(rf"(?<![a-z])({'|'.join(RENAMED)})(?![a-z])")
+
 TABLE = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
 RUNS: dict[str, str] = TABLE["runs"]
 
 
 def write_inputs(out: Path, checkout: Path) -> None:
-    """Write small photos, frames, a film, a group, flashes of Extended Yale B and a folder of truths."""
+    """Write small photos, frames, a video, a group, flashes of Extended Yale B and a folder of truths."""
     import av
     from PIL import Image
 
@@ -64,7 +75,7 @@ def write_inputs(out: Path, checkout: Path) -> None:
     shutil.copy(checkout / "examples/maps/low_sun.exr", out / "sun.exr")
     photo.save(out / "truths/photo_light_70_20.png")
     frames = [whole.crop((110 + 2 * i, 10, 334 + 2 * i, 202)) for i in range(3)]
-    with av.open(str(out / "film.mov"), "w") as container:
+    with av.open(str(out / "video.mov"), "w") as container:
         stream: Any = container.add_stream("prores_ks", rate=25)
         stream.width, stream.height, stream.pix_fmt = 224, 192, "yuv422p10le"
         for frame in frames:
@@ -177,8 +188,8 @@ def image_values(path: Path) -> Values:
     return values
 
 
-def film_values(path: Path) -> Values:
-    """Frames of a film."""
+def video_values(path: Path) -> Values:
+    """Frames of a video."""
     import av
 
     with av.open(str(path)) as container:
@@ -229,11 +240,16 @@ def numbers_of(content: Any, name: str) -> Iterator[tuple[str, float]]:
 
 READERS: dict[str, Callable[[Path], Values]] = {
     **dict.fromkeys((".exr", ".png", ".tif", ".tiff", ".jpg", ".hdr"), image_values),
-    **dict.fromkeys((".mp4", ".mov"), film_values),
+    **dict.fromkeys((".mp4", ".mov"), video_values),
     **dict.fromkeys((".npz", ".npy", ".safetensors"), array_values),
     **dict.fromkeys((".glb", ".obj"), mesh_values),
     **dict.fromkeys((".json", ".jsonl", ".csv", ".txt", ".toml", ".xml", ".md"), number_values),
 }
+
+
+def renamed(name: str) -> str:
+    """Return a name with its old words replaced."""
+    return OLD_WORD.sub(lambda match: RENAMED[match[0]], name)
 
 
 def difference(a: Path, b: Path) -> tuple[float, str]:
@@ -243,6 +259,7 @@ def difference(a: Path, b: Path) -> tuple[float, str]:
         share = abs(sizes[0] - sizes[1]) / max(*sizes, 1)
         return (share if share > 0.01 else 0.0), f"{sizes[0]} and {sizes[1]} bytes"
     before, after = READERS[a.suffix](a), READERS[a.suffix](b)
+    before = {renamed(name): values for name, values in before.items()}
     if odd := sorted(before.keys() ^ after.keys()):
         return np.inf, f"{len(odd)} names in one alone: {', '.join(odd[:3])}"
     worst = 0.0, ""
@@ -259,23 +276,22 @@ def difference(a: Path, b: Path) -> tuple[float, str]:
     return worst
 
 
-def files_of(folder: Path, only: str) -> set[str]:
-    """Paths of results in a folder of `make`: of chosen runs, or of all."""
+def files_of(folder: Path, only: str, rename: Callable[[str], str] = str) -> dict[str, Path]:
+    """Files of results by name in a folder of `make`: of chosen runs, or of all."""
     wanted = chosen(only) if only else None
-    names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     left_out = re.compile(r"^\.|/\.|log\.txt$|/events\.out")
-    return {
-        name for name in names if not left_out.search(name) and (not wanted or name.split("/")[0] in wanted)
-    }
+    paths = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if path.is_file()}
+    files = {rename(name): path for name, path in paths.items() if not left_out.search(name)}
+    return {name: path for name, path in files.items() if not wanted or name.split("/")[0] in wanted}
 
 
 def compare(a: Path, b: Path, only: str, within: float) -> int:
     """Print what differs and the counts; 1 where anything does."""
-    before, after = files_of(a, only), files_of(b, only)
+    before, after = files_of(a, only, renamed), files_of(b, only)
     equal = differ = 0
-    for name in sorted(before & after):
+    for name in sorted(before.keys() & after.keys()):
         try:
-            share, words = difference(a / name, b / name)
+            share, words = difference(before[name], after[name])
         except Exception as error:  # a file that one cannot read is a difference
             share, words = np.inf, f"cannot be read: {error}"
         if share <= within:
@@ -283,10 +299,11 @@ def compare(a: Path, b: Path, only: str, within: float) -> int:
         else:
             differ += 1
             print(f"differs {share:8.2g}  {name}  {words}")
-    for name in sorted(before ^ after):
+    missing = sorted(before.keys() ^ after.keys())
+    for name in missing:
         print(f"missing in {b if name in before else a}: {name}")
-    print(f"{equal} equal, {differ} differ, {len(before ^ after)} missing")
-    return int(bool(differ or before ^ after))
+    print(f"{equal} equal, {differ} differ, {len(missing)} missing")
+    return int(bool(differ or missing))
 
 
 def main() -> int:

@@ -38,7 +38,7 @@ PHOTO_SUFFIXES = frozenset(
 MAP_SUFFIXES = frozenset({".exr", ".hdr"})
 _SUFFIXES_OF = {"--landmarks": (".json", ".pts"), "--normals-from": (".npy", ".exr", ".png")}
 COMPANION = "FILE|DIR|PATTERN"  # placeholder of options that name a file for each input
-FILM_SUFFIXES = frozenset({".mp4", ".mov", ".webm", ".mkv", ".m4v", ".avi", ".mxf", ".mts", ".m2ts"})
+VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".webm", ".mkv", ".m4v", ".avi", ".mxf", ".mts", ".m2ts"})
 _STACK, _SHEET = "_olat.exr", "_olat.png"  # a stack's contact sheet is not a photo
 _FRAMES = re.compile(r"(.*?)(\d+)-(\d+)(\.\w+)", re.DOTALL)  # plate.1001-1050.exr
 _NUMBERED = re.compile(r"(.*?)(?:%0?(\d*)d|(#{2,}))([^/\\]*)", re.DOTALL)  # plate.%04d.exr, plate.####.exr
@@ -244,8 +244,8 @@ def _as_frames(files: Sequence[tuple[Path, PurePosixPath]]) -> Iterator[tuple[Pa
         differ = [number for number, column in enumerate(columns) if len(set(column)) > 1]
         at = 2 * (differ or [len(columns) - 1])[-1] + 1
         for path, mirrored, parts in group:
-            is_film = mirrored.suffix.lower() in FILM_SUFFIXES
-            if not columns or is_film or DOTTED.fullmatch(mirrored.stem):
+            is_video = mirrored.suffix.lower() in VIDEO_SUFFIXES
+            if not columns or is_video or DOTTED.fullmatch(mirrored.stem):
                 yield path, mirrored
                 continue
             before, after = "".join(parts[:at]), "".join(parts[at + 1 :])
@@ -284,7 +284,7 @@ def _ignores_case(folder: Path) -> bool:
 def only_item(items: Sequence[Item], output: Path, several: bool) -> Item:
     """Return the item whose only output is the file that `-o` names; UsageError for several outputs."""
     item = items[0]
-    if several or len(items) > 1 or item.input_path.suffix.lower() in FILM_SUFFIXES:
+    if several or len(items) > 1 or item.input_path.suffix.lower() in VIDEO_SUFFIXES:
         raise UsageError(f"-o {output}: names a single file; use one photo, face and light, or a folder")
     return replace(item, output_base=output.with_suffix(""), name=output.stem)
 

@@ -61,8 +61,8 @@ InputsArgument = Annotated[
 FramesArgument = Annotated[
     list[str],
     typer.Argument(
-        metavar="PHOTO|FILM...",
-        help="Images, films (.mp4, .mov, .mkv and more), folders of images (searched recursively), frames "
+        metavar="PHOTO|VIDEO...",
+        help="Images, videos (.mp4, .mov, .mkv and more), folders of images (searched recursively), frames "
         "(plate.%04d.exr), or - for an image or a list.",
         show_default=False,
     ),

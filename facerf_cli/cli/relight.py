@@ -25,7 +25,7 @@ from facerf_cli.work.output_options import STDOUT, SUFFIXES, check_stdout, forma
 from facerf_cli.work.photo_options import networks_of
 from facerf_cli.work.photo_work import PHOTOS_A_PROCESS, FileOrFolder
 from facerf_cli.work.relight_options import RelightOptions, RelightPlan, plan_relight
-from facerf_cli.work.shots import FRAMES_IN_A_ROW, ShotOptions, Shots, collect_frames, film_output
+from facerf_cli.work.shots import FRAMES_IN_A_ROW, ShotOptions, Shots, collect_frames, video_output
 
 log = logging.getLogger(LOGGER_NAME)
 
@@ -118,7 +118,7 @@ def relight(
     interpolated from the three surrounding ones.
     """
     file, formats = format_of_file(output), options.output.formats
-    film = None if file else film_output(output, options.fps)
+    video = None if file else video_output(output, options.fps)
     unused = f"is not supported with -o {output}; remove it"
     if file is not None:
         formats = (file,) if is_default(context, "formats") else formats
@@ -129,9 +129,9 @@ def relight(
         options = replace(options, output=one_file, name=NamePattern.literal(output.stem))
         batch = replace(batch, output=output).of_file()
         output = output.parent
-    elif film is not None:
+    elif video is not None:
         refuse_given(context, ("formats", "name", "report"), unused)
-        formats, output = film.formats, film.folder
+        formats, output = video.formats, video.folder
     elif output == STDOUT:
         refuse_given(context, ("dry_run", "report"), unused)
         formats = ("png",) if is_default(context, "formats") else formats
@@ -144,8 +144,8 @@ def relight(
         digest_of = Journal(output, RelightJob.verb, batch.shard, batch.file).digest_of
     plan = plan_relight(options, sources, output, digest_of)
     has_alpha = plan.options.background.kind == "none" or plan.options.composite == "face"
-    if has_alpha and film and not film.holds_alpha:
-        raise UsageError(f"-o {film.path}: has no alpha; use FILE.mov, a folder, or --background COLOUR")
+    if has_alpha and video and not video.holds_alpha:
+        raise UsageError(f"-o {video.path}: has no alpha; use FILE.mov, a folder, or --background COLOUR")
     if has_alpha and "jpg" in formats:
         log.warning("JPEG has no alpha, so the background is black; use png, tiff or exr to keep alpha")
     if output == STDOUT:
@@ -163,15 +163,15 @@ def relight(
     if taken and options.normals_from is not None:
         raise UsageError("--normals-from: requires photos, not frames of a shot; remove it")
     plan = plan.of_items(items, Shots(taken), output)
-    batch = replace(batch, in_a_row=FRAMES_IN_A_ROW if taken else 1, print_outputs=film is None)
+    batch = replace(batch, in_a_row=FRAMES_IN_A_ROW if taken else 1, print_outputs=video is None)
     written = [path for item in items for path in plan.outputs_of(item)]
-    refuse_read([film.path] if film else written, files_read((items, plan, sources), items))
+    refuse_read([video.path] if video else written, files_read((items, plan, sources), items))
     if not batch.dry_run:
         plan.write_maps()  # before the outputs' keys, which contain digests of the maps
-    recipe = film.recipe_if_new(items, taken, written, plan.recipes_of, batch) if film else ""
-    if film is not None and not recipe:
+    recipe = video.recipe_if_new(items, taken, written, plan.recipes_of, batch) if video else ""
+    if video is not None and not recipe:
         return
     code = run_items(RelightJob(plan), items, batch, plan.photo.settings)
-    if film is not None:
-        code = film.joined(items, written, taken, recipe, code)
+    if video is not None:
+        code = video.joined(items, written, taken, recipe, code)
     raise typer.Exit(code)

@@ -11,7 +11,7 @@ from typing import Literal, Self
 from facerf_cli.baselines import Kind, RelightKind
 from facerf_cli.batch.inputs import (
     COMPANION,
-    FILM_SUFFIXES,
+    VIDEO_SUFFIXES,
     Item,
     NamePattern,
     is_pattern,
@@ -47,7 +47,7 @@ from facerf_cli.work.photo_options import (
     parse_pose,
     refuse,
 )
-from facerf_cli.work.shots import Shots, film_rate, recipe_of_shots
+from facerf_cli.work.shots import Shots, recipe_of_shots, video_rate
 
 Composite = Literal["photo", "face"]
 BackgroundKind = Literal["photo", "envmap", "none", "file", "colour"]
@@ -84,7 +84,7 @@ def parse_background(text: str) -> BackgroundChoice:
     if text in ("photo", "envmap", "none"):
         return BackgroundChoice(text)  # type: ignore[arg-type]
     path = Path(text)
-    if path.suffix.lower() in FILM_SUFFIXES:
+    if path.suffix.lower() in VIDEO_SUFFIXES:
         advice = f"convert it to images (ffmpeg -i {path.name} bg/%04d.png), and pass their folder"
         raise UsageError(f"--background {path}: videos are not supported; {advice}")
     if path.is_file():
@@ -194,7 +194,7 @@ class RelightOptions(FieldOptions, PortraitOptions):
     matte: Path | None = option(None, metavar=COMPANION, shown_default=False, panel=IMAGE)
     identity: bool = option(False, in_recipe=False, panel=METHOD)
     fps: Fraction | None = option(
-        None, metavar="RATE", in_recipe=False, shown_default="the EXR's, or 24", parse=film_rate, panel=IMAGE
+        None, metavar="RATE", in_recipe=False, shown_default="the EXR's, or 24", parse=video_rate, panel=IMAGE
     )
     name: NamePattern | None = option(
         None,

@@ -13,8 +13,8 @@ import numpy as np
 from facerf_cli.batch.inputs import Item
 from facerf_cli.errors import InputError
 from facerf_cli.face.landmarks import read_landmarks
-from facerf_cli.files.film import Film
 from facerf_cli.files.read import LinearImage
+from facerf_cli.files.video import Video
 from facerf_cli.image.colour import SRGB, named_space, to_display, to_linear_rec709, unit_floats
 from facerf_cli.portrait.find import face_at, face_with
 from facerf_cli.portrait.segment import Segmentation
@@ -46,8 +46,8 @@ class ShotFrames:
 
     def __init__(self, shot: Shot, options: PhotoOptions) -> None:
         self._shot, self._options = shot, options
-        self._film = Film(shot.film) if shot.film else None
-        stated = self._film.space if self._film else SRGB
+        self._video = Video(shot.video) if shot.video else None
+        stated = self._video.space if self._video else SRGB
         space = options.colourspace
         self._space = stated if space is None else named_space(space, options.ocio_config)
 
@@ -68,9 +68,9 @@ class ShotFrames:
 
     def read(self, number: int) -> LinearImage:
         """Read a frame with its alpha."""
-        if self._film is None:
+        if self._video is None:
             return read_photo(self._shot.frames[number], self._options, in_shot=True)
-        values = self._film.read(number)
+        values = self._video.read(number)
         pixels = np.ascontiguousarray(to_linear_rec709(values[..., :3], self._space), np.float32)
         alpha = unit_floats(values[..., 3]) if values.shape[2] == 4 else None
         return LinearImage(pixels, alpha, self._space.name)

@@ -13,8 +13,8 @@ from typing import Any
 
 from facerf_cli.batch.inputs import (
     DOTTED,
-    FILM_SUFFIXES,
     PHOTO_SUFFIXES,
+    VIDEO_SUFFIXES,
     Item,
     NamePattern,
     collect_items,
@@ -61,7 +61,7 @@ class Shot:
 
     base: Path  # output folder / name
     frames: tuple[Item, ...]
-    film: Path | None = None
+    video: Path | None = None
     cuts: bool = True  # each part between cuts is processed on its own
 
     @property
@@ -94,10 +94,10 @@ def collect_frames(
     inputs_found = collect_items(
         inputs, batch.output, PHOTO_SUFFIXES, pattern, photo.settings.null_separated, options.sequence
     )
-    films = [item for item in inputs_found if item.input_path.suffix.lower() in FILM_SUFFIXES]
-    photos = [item for item in inputs_found if item not in films]
-    shots = [_of_film(item, pattern) for item in films if item.input_path.exists()]
-    missing = [item for item in films if not item.input_path.exists()]  # reported like missing photos
+    videos = [item for item in inputs_found if item.input_path.suffix.lower() in VIDEO_SUFFIXES]
+    photos = [item for item in inputs_found if item not in videos]
+    shots = [_of_video(item, pattern) for item in videos if item.input_path.exists()]
+    missing = [item for item in videos if not item.input_path.exists()]  # reported like missing photos
     if options.sequence:
         shots += _of_images(photos)
         photos = []
@@ -115,7 +115,7 @@ def collect_frames(
             "--face all: only one face per shot is supported; use --face INDEX for each": photo.face == "all",
             "--geometry network: shots are fitted to landmarks; remove it": photo.geometry == "network",
             "--landmarks: not supported for frames of a video; remove it": (
-                photo.landmarks is not None and any(shot.film for shot in shots)
+                photo.landmarks is not None and any(shot.video for shot in shots)
             ),
             "--shard: frames of a shot must stay together; use --jobs": batch.shard.of > 1,
         }
@@ -123,10 +123,10 @@ def collect_frames(
     return [*photos, *missing, *(item for shot in shots for item in shot.frames)], tuple(shots)
 
 
-def _of_film(item: Item, pattern: NamePattern | None) -> Shot:
-    from facerf_cli.files.film import film_timing
+def _of_video(item: Item, pattern: NamePattern | None) -> Shot:
+    from facerf_cli.files.video import video_timing
 
-    count = len(film_timing(item.input_path).times_s)
+    count = len(video_timing(item.input_path).times_s)
     digits = max(_DIGITS, len(str(count - 1)))
     mirrored = item.mirrored or PurePosixPath(item.input_path.name)
     folder = item.output_base.parents[len(PurePosixPath(item.name).parts) - 1]
@@ -175,7 +175,7 @@ def _consecutive(photos: Sequence[Item]) -> tuple[Path, str] | None:
 def recipe_of_shots(shots: Sequence[Shot], digest_of: DigestOf) -> Recipe:
     """Return recipe entries: --no-cuts, and all images of sequences, since frames depend on neighbours."""
     recipe: Recipe = {} if all(shot.cuts for shot in shots) else {"cuts": False}
-    images = [item.input_path for shot in shots if shot.film is None for item in shot.frames]
+    images = [item.input_path for shot in shots if shot.video is None for item in shot.frames]
     if not images:
         return recipe
     try:
@@ -196,7 +196,7 @@ def whole_shots(items: Sequence[Item], shots: Sequence[Shot]) -> list[Item]:
 
 
 @dataclass(frozen=True)
-class FilmOutput:
+class VideoOutput:
     """The video to write, and its frame rate if the user chose one."""
 
     path: Path
@@ -239,12 +239,12 @@ class FilmOutput:
                 f"-o {self.path}: one video needs one video and one light, or one photo and --rotate "
                 "FROM:TO:N; for more, use a folder"
             )
-        film = shots[0].film if shots else None
-        if self.rate and film:
+        video = shots[0].video if shots else None
+        if self.rate and video:
             raise UsageError("--fps: a video keeps its own frame times; remove it")
         journal = self._journal
         inputs = [journal.digest_of(item.input_path) for item in items]
-        recipe = key_of({"film": recipes_of(journal.digest_of), "inputs": inputs, "rate": str(self.rate)})
+        recipe = key_of({"video": recipes_of(journal.digest_of), "inputs": inputs, "rate": str(self.rate)})
         if not journal.to_make(items[0], [self.path], [recipe], batch.overwrite):
             log.info("%s: up to date", self.path)
             if batch.overwrite == "changed" and not batch.dry_run:
@@ -253,10 +253,10 @@ class FilmOutput:
         if batch.dry_run:
             print(named(f"{items[0].input_path} -> {self.path}"))
             return ""
-        if film:
-            from facerf_cli.files.film_writer import check_writable
+        if video:
+            from facerf_cli.files.video_writer import check_writable
 
-            check_writable(self.path, film)
+            check_writable(self.path, video)
         elif len({_stated(item, self.rate)[0] for item in items}) > 1:
             log.warning("%s: frames state different rates; using the first one's (--fps)", self.path)
         return recipe
@@ -270,17 +270,17 @@ class FilmOutput:
                 "%s: not written because frames failed; the others remain in %s", self.path, self.folder
             )
             return 1
-        from facerf_cli.files.film import Timing, film_timing
-        from facerf_cli.files.film_writer import write_film
+        from facerf_cli.files.video import Timing, video_timing
+        from facerf_cli.files.video_writer import write_video
         from facerf_cli.run.logs import Provenance
 
-        source = shots[0].film if shots else None
-        timing = film_timing(source) if source else Timing.steady(len(images), *_stated(items[0], self.rate))
+        source = shots[0].video if shots else None
+        timing = video_timing(source) if source else Timing.steady(len(images), *_stated(items[0], self.rate))
         facts = Provenance(source.name if source else "").attributes()
         provenance = "; ".join(f"{name}={value}" for name, value in facts.items())
         key = self._journal.key_of(items[0], recipe)
         comment = f"Synthetic: relit by a trained model; {provenance}; facerf:key={key}"
-        write_film(self.path, images, timing, comment)
+        write_video(self.path, images, timing, comment)
         self._journal.add_file(items[0], self.path, recipe)
         frames = Journal(self.folder, "relight")
         edited = {path for path in images if frames.refusal(path)}
@@ -302,7 +302,7 @@ def _stated(item: Item, rate: Fraction | None) -> tuple[Fraction, str]:
     timecode, stated = "", metadata.get("framesPerSecond")
     if rate is None and isinstance(stated, tuple):
         with suppress(UsageError):
-            rate = film_rate("/".join(map(str, stated)))
+            rate = video_rate("/".join(map(str, stated)))
     with suppress(LookupError, TypeError):  # not a timecode
         packed = metadata["smpte:TimeCode"][0]  # SMPTE 12M: BCD digits, between them flags
         timecode = (packed & 0x3F7F7F3F).to_bytes(4, "big").hex(":")
@@ -310,21 +310,21 @@ def _stated(item: Item, rate: Fraction | None) -> tuple[Fraction, str]:
     return rate or _RATE, timecode
 
 
-def film_output(output: Path, rate: Fraction | None) -> FilmOutput | None:
+def video_output(output: Path, rate: Fraction | None) -> VideoOutput | None:
     """Return the video that `-o` names; None for a folder."""
     suffix = output.suffix.lower()
     if suffix in _FORMATS and not output.is_dir():
-        from facerf_cli.files.film import require_av
+        from facerf_cli.files.video import require_av
 
         require_av(output)
-        return FilmOutput(output, rate)
-    if suffix in FILM_SUFFIXES and not output.is_dir():
+        return VideoOutput(output, rate)
+    if suffix in VIDEO_SUFFIXES and not output.is_dir():
         raise UsageError(f"-o {output}: videos are written as .mp4 or .mov; use one of these")
     folder_not_file(output, ".exr, .png, .jpg, .tif, .mp4 or .mov")
     return None
 
 
-def film_rate(text: str) -> Fraction:
+def video_rate(text: str) -> Fraction:
     """Parse `--fps`, frames per second."""
     try:
         rate = Fraction(text).limit_denominator(_FINEST_RATE)

@@ -57,7 +57,7 @@ def test_folders_are_mirrored_and_named_files_stand_alone(photos: Path, tmp_path
 
 def test_what_a_folder_passes_over_is_counted_and_named(photos: Path, tmp_path: Path, caplog: Log) -> None:
     caplog.set_level(logging.INFO, "facerf")
-    for name in ("a.nef", "x/b.NEF", "film.mp4", "LICENCE", "d.bmp", "e.gif", "f.jfif", "g.jpe"):
+    for name in ("a.nef", "x/b.NEF", "video.mp4", "LICENCE", "d.bmp", "e.gif", "f.jfif", "g.jpe"):
         (photos / name).touch()
     (tmp_path / "others").mkdir()
     (photos / "x" / "linked").symlink_to(tmp_path / "others")

@@ -9,8 +9,8 @@ from skimage.data import astronaut
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
-from _film_of_photo import camera_at, panned
 from _talking_head import Clip
+from _video_of_photo import camera_at, panned
 from flicker import ROUGH, changes, flicker, flow_between, steady_twin, warped_errors
 
 from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear

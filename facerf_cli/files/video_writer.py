@@ -16,8 +16,8 @@ import numpy as np
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.film import BT709, Film, Timing, exact, reason, require_av, start_s
 from facerf_cli.files.read import PHOTO_LIMIT_PX, decode
+from facerf_cli.files.video import BT709, Timing, Video, exact, reason, require_av, start_s
 from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear, unit_floats
 from facerf_cli.run.logs import LOGGER_NAME
 
@@ -56,10 +56,10 @@ _ALPHA_FORM = replace(
 
 def check_writable(path: Path, source: Path) -> None:
     """Raise InputError, before frames are rendered, if a video cannot have the sound of another."""
-    av, film = require_av(path), Film(source)
+    av, video = require_av(path), Video(source)
     try:
         with av.open(io.BytesIO(), "w", format=path.suffix[1:].lower()) as container:
-            _begin(av, container, _FORMS[path.suffix.lower()], film.read(0).shape[:2], film.timing)
+            _begin(av, container, _FORMS[path.suffix.lower()], video.read(0).shape[:2], video.timing)
             container.start_encoding()
     except (av.error.FFmpegError, ValueError) as error:
         raise InputError(
@@ -67,7 +67,7 @@ def check_writable(path: Path, source: Path) -> None:
         ) from None
 
 
-def write_film(path: Path, images: Sequence[Path], timing: Timing, comment: str) -> None:
+def write_video(path: Path, images: Sequence[Path], timing: Timing, comment: str) -> None:
     """Write PNG images as a video atomically; `comment` goes into its metadata.
 
     .mov keeps alpha in ProRes 4444, .mp4 shows the images over black.

@@ -74,7 +74,7 @@ class _Reader:
     next: int = 0
 
 
-class Film:
+class Video:
     """Frames of a video by number, decoded in order, without seeking.
 
     Each of up to three readers only moves forward, and the nearest one decodes a frame. So reading the key
@@ -255,11 +255,11 @@ def start_s(container: Any) -> Fraction:
     return max(Fraction(0), Fraction(container.start_time or 0, _MICROSECONDS))
 
 
-def film_timing(path: Path) -> Timing:
+def video_timing(path: Path) -> Timing:
     """Read the timing of a video; decoding its first frame also rejects HDR."""
-    film = Film(path)
-    film.read(0)
-    return film.timing
+    video = Video(path)
+    video.read(0)
+    return video.timing
 
 
 def reason(error: Exception) -> str:

@@ -1,4 +1,4 @@
-"""Films and sequences from the command line, by the face's field with a network that is Lambert's law."""
+"""Videos and sequences from the command line, by the face's field with a network that is Lambert's law."""
 
 import json
 import os
@@ -26,13 +26,13 @@ from facerf_cli.work.relight import with_background
 from facerf_cli.work.relight_options import RelightOptions, parse_background, plan_relight
 from facerf_cli.work.sequence import OpenShot, ShotFrames
 from facerf_cli.work.sequence import _made_from as made_from
-from facerf_cli.work.shots import FilmOutput, ShotOptions, Shots, collect_frames, film_rate
+from facerf_cli.work.shots import ShotOptions, Shots, VideoOutput, collect_frames, video_rate
 from tests.cli.toy_checkpoint import save_toy_checkpoint
 from tests.folders import only_row
 from tests.folders import rows as rows_of
 from tests.kinds import Folders, Log, Patch, Said
 
-av: Any = pytest.importorskip("av", reason="films need av: pip install 'facerf[video]'")
+av: Any = pytest.importorskip("av", reason="videos need av: pip install 'facerf[video]'")
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
 FRAMES = 3
 CHEAP = ("--reflectance", "field", "--lights", "12")
@@ -45,7 +45,7 @@ def frame_of(number: int) -> np.ndarray:
 
 
 def write_source(path: Path, frames: Iterator[np.ndarray] | list[np.ndarray]) -> None:
-    """A film of 25 frames a second with silence."""
+    """A video of 25 frames a second with silence."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=25)
         stream.width, stream.height, stream.pix_fmt, stream.options = 224, 192, "yuv420p", {"crf": "12"}
@@ -62,7 +62,7 @@ def write_source(path: Path, frames: Iterator[np.ndarray] | list[np.ndarray]) ->
 
 
 def write_qtrle(path: Path, frames: list[np.ndarray]) -> None:
-    """A film of frames [192, 224, 4], without loss."""
+    """A video of frames [192, 224, 4], without loss."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream("qtrle", rate=25)
         stream.width, stream.height, stream.pix_fmt = 224, 192, "argb"
@@ -73,7 +73,7 @@ def write_qtrle(path: Path, frames: list[np.ndarray]) -> None:
 
 @pytest.fixture(scope="module")
 def given(tmp_path_factory: Folders) -> Path:
-    """A folder with a checkpoint, a small photo and a film."""
+    """A folder with a checkpoint, a small photo and a video."""
     folder = tmp_path_factory.mktemp("given")
     save_toy_checkpoint(folder / "lambert.safetensors")
     write_source(folder / "me.mp4", [frame_of(number) for number in range(FRAMES)])
@@ -89,7 +89,7 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
 
 
-def test_a_film_becomes_numbered_images_of_one_identity_and_exposure(
+def test_a_video_becomes_numbered_images_of_one_identity_and_exposure(
     given: Path, tmp_path: Path, capsys: Said
 ) -> None:
     out = tmp_path / "out"
@@ -101,7 +101,7 @@ def test_a_film_becomes_numbered_images_of_one_identity_and_exposure(
     assert len({tuple(row["exposure_ev"].values()) for row in rows}) == 1
     track = [json.loads(line) for line in (out / "me_track.jsonl").read_text().splitlines()][1:]
     left = [np.mean(row["landmarks"], 0)[0] for row in track]
-    assert np.diff(left) == pytest.approx([-2] * (FRAMES - 1), abs=0.5)  # pixels: as the film moves
+    assert np.diff(left) == pytest.approx([-2] * (FRAMES - 1), abs=0.5)  # pixels: as the video moves
     capsys.readouterr()
     assert facerf(given, "relight", given / "me.mp4", "--light", "70,20", "-o", out, *CHEAP) == 0
     assert capsys.readouterr().out == "" and names(out) == sorted([*images, "me_track.jsonl"])
@@ -110,7 +110,7 @@ def test_a_film_becomes_numbered_images_of_one_identity_and_exposure(
 def test_all_frames_have_the_one_light_of_the_picture_behind_them(
     given: Path, tmp_path: Path, monkeypatch: Patch, capsys: Said
 ) -> None:
-    """It is guessed once; a film in its place is refused."""
+    """It is guessed once; a video in its place is refused."""
     guessed = []
     monkeypatch.setattr(estimate_light, "stated_fov_deg", lambda image: guessed.append(image))
     ramp = np.linspace(20, 220, 60).astype(np.uint8)[None, :, None]
@@ -124,8 +124,8 @@ def test_all_frames_have_the_one_light_of_the_picture_behind_them(
     rows = list(rows_of(out).values())
     assert all(list(row["exposure_ev"].values()) == [0] for row in rows)
     capsys.readouterr()
-    film = ("--background", given / "me.mp4", "--light-from", "background", "--dry-run")
-    assert facerf(given, "relight", given / "small.png", *film, "-o", tmp_path / "no", *CHEAP) == 2
+    video = ("--background", given / "me.mp4", "--light-from", "background", "--dry-run")
+    assert facerf(given, "relight", given / "small.png", *video, "-o", tmp_path / "no", *CHEAP) == 2
     assert "me.mp4: videos are not supported" in capsys.readouterr().err
 
 
@@ -172,7 +172,7 @@ def test_each_frame_has_its_image_of_a_moving_background(given: Path, tmp_path: 
         ("empty", ["me.mp4"], "no inputs found"),
         ("bg/{frames}.png", ["small.png"], "unknown field {frames}"),
         ("bg/{stem}.mov", ["small.png"], "videos are not supported"),
-        ("film", ["me.mp4"], "film: not a readable image"),
+        ("video", ["me.mp4"], "video: not a readable image"),
         ("text.png", ["small.png"], "text.png: not a readable image"),
     ],
 )
@@ -183,7 +183,7 @@ def test_a_background_that_does_not_fit_is_refused_before_the_first_frame(
         (tmp_path / name).mkdir()
     for number in (1, 2):
         Image.new("RGB", (6, 4)).save(tmp_path / f"bg/b.{number}.png")
-    shutil.copy(given / "me.mp4", tmp_path / "film")
+    shutil.copy(given / "me.mp4", tmp_path / "video")
     (tmp_path / "text.png").write_text("not an image")
     line = ("--background", tmp_path / background, "--light", "60,20", "-o", tmp_path / "out", "--dry-run")
     assert facerf(given, "relight", *(given / name for name in inputs), *line, *CHEAP) == 2
@@ -206,7 +206,7 @@ def test_photos_have_backgrounds_by_their_names(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_an_interrupted_film_goes_on_where_it_was(given: Path, tmp_path: Path, monkeypatch: Patch) -> None:
+def test_an_interrupted_video_goes_on_where_it_was(given: Path, tmp_path: Path, monkeypatch: Patch) -> None:
     out, made = tmp_path / "relit.mp4", []
     line = ("relight", given / "me.mp4", "--light", "70,20", "-o", out, "--exposure", "0", *CHEAP)
     fitted = OpenShot.fitted
@@ -231,7 +231,7 @@ def test_an_interrupted_film_goes_on_where_it_was(given: Path, tmp_path: Path, m
     assert comment.startswith("Synthetic") and "IPTC:DigitalSourceType" in comment
     before = out.stat().st_mtime_ns
     assert facerf(given, *line) == 0 and out.stat().st_mtime_ns == before and len(made) == 4
-    assert facerf(given, *line, "--light", "60,20") == 2  # two lights are two films
+    assert facerf(given, *line, "--light", "60,20") == 2  # two lights are two videos
 
 
 def test_a_still_photo_under_a_turning_map_is_smooth(given: Path, tmp_path: Path) -> None:
@@ -254,7 +254,7 @@ def test_a_still_photo_under_a_turning_map_is_smooth(given: Path, tmp_path: Path
     assert np.abs(left).max() < 4e-3 * flat.max()
 
 
-def test_a_photo_under_a_turning_map_becomes_a_film(
+def test_a_photo_under_a_turning_map_becomes_a_video(
     given: Path, tmp_path: Path, monkeypatch: Patch, capsys: Said
 ) -> None:
     write_exr(tmp_path / "grey.exr", np.full((8, 16, 3), 0.3, np.float32))
@@ -267,7 +267,7 @@ def test_a_photo_under_a_turning_map_becomes_a_film(
         assert float(stream.average_rate) == pytest.approx(30000 / 1001, rel=1e-3)
         assert "facerf:key=" in container.metadata["comment"]
     before = out.read_bytes()
-    for cache in ("here", "elsewhere"):  # a fresh cache knows the film by the key that it carries
+    for cache in ("here", "elsewhere"):  # a fresh cache knows the video by the key that it carries
         in_cache = partial(lambda cache, file: tmp_path / cache / f"{file.name}.jsonl", cache)
         monkeypatch.setattr("facerf_cli.batch.journal._in_cache", in_cache)
         capsys.readouterr()
@@ -317,7 +317,7 @@ def test_a_sequence_with_a_hole_is_said(
         assert said.out == "" and len(names(tmp_path)) == 3
 
 
-def test_a_film_of_a_sequence_has_the_rate_and_the_timecode_of_its_headers(
+def test_a_video_of_a_sequence_has_the_rate_and_the_timecode_of_its_headers(
     given: Path, tmp_path: Path
 ) -> None:
     for number in range(2):
@@ -367,21 +367,21 @@ def test_rates_that_headers_state(
         Image.fromarray(np.zeros((16, 16, 3), np.uint8)).save(images[-1])
     batch = BatchOptions(output=tmp_path / "me.mp4.frames")
     items, shots = collect_frames([str(tmp_path / "me_%d.exr")], ShotOptions(True), batch, PHOTO_OPTIONS)
-    film = FilmOutput(tmp_path / "me.mp4", film_rate(given_rate) if given_rate else None)
-    film.folder.mkdir()
-    recipe = film.recipe_if_new(items, shots, images, lambda digest_of: [], batch)
+    video = VideoOutput(tmp_path / "me.mp4", video_rate(given_rate) if given_rate else None)
+    video.folder.mkdir()
+    recipe = video.recipe_if_new(items, shots, images, lambda digest_of: [], batch)
     assert ("me.mp4: frames state different rates" in caplog.text) == (len(set(stated)) > 1)
-    slow = FilmOutput(film.path, Fraction(12))
+    slow = VideoOutput(video.path, Fraction(12))
     assert slow.recipe_if_new(items, shots, images, lambda digest_of: [], batch) != recipe
-    assert film.joined(items, images, shots, recipe, 0) == 0
-    with av.open(str(film.path)) as container:
+    assert video.joined(items, images, shots, recipe, 0) == 0
+    with av.open(str(video.path)) as container:
         (stream, *_) = container.streams
         assert (stream.average_rate, stream.metadata.get("timecode")) == expected
 
 
 @pytest.mark.slow
-def test_alpha_of_a_film_is_kept(given: Path, tmp_path: Path, capsys: Said) -> None:
-    """As a photo's: in frames, and in a film of frames that can have it; the other is said."""
+def test_alpha_of_a_video_is_kept(given: Path, tmp_path: Path, capsys: Said) -> None:
+    """As a photo's: in frames, and in a video of frames that can have it; the other is said."""
     clear = np.zeros((192, 224), np.uint8)
     clear[:, 112:] = 255
     write_qtrle(tmp_path / "cut.mov", [np.dstack([frame_of(number), clear]) for number in range(2)])
@@ -424,14 +424,14 @@ def test_alpha_that_is_0_in_every_frame_is_none(tmp_path: Path, name: str, caplo
         caplog.clear()
 
 
-def test_a_film_of_the_same_size_and_time_has_another_track(tmp_path: Path) -> None:
-    film, options = tmp_path / "me.mov", PhotoOptions(Settings())
-    write_qtrle(film, [np.dstack([frame_of(0), np.full((192, 224), 255, np.uint8)])] * 2)
-    (shot,) = collect_frames([str(film)], ShotOptions(), BatchOptions(tmp_path / "out"), options)[1]
-    head, before = made_from(shot, options), film.stat()
+def test_a_video_of_the_same_size_and_time_has_another_track(tmp_path: Path) -> None:
+    video, options = tmp_path / "me.mov", PhotoOptions(Settings())
+    write_qtrle(video, [np.dstack([frame_of(0), np.full((192, 224), 255, np.uint8)])] * 2)
+    (shot,) = collect_frames([str(video)], ShotOptions(), BatchOptions(tmp_path / "out"), options)[1]
+    head, before = made_from(shot, options), video.stat()
     assert made_from(shot, options) == head
-    film.write_bytes(film.read_bytes())
-    os.utime(film, ns=(before.st_atime_ns, before.st_mtime_ns))
+    video.write_bytes(video.read_bytes())
+    os.utime(video, ns=(before.st_atime_ns, before.st_mtime_ns))
     assert made_from(shot, options) != head
 
 
@@ -478,7 +478,7 @@ def test_sound_that_cannot_be_written_is_said_before_the_first_frame(
     assert names(tmp_path) == ["a.mkv"]
 
 
-def test_one_light_is_estimated_for_a_film(given: Path, tmp_path: Path) -> None:
+def test_one_light_is_estimated_for_a_video(given: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert facerf(given, "estimate-light", given / "me.mp4", "--lights", "20", "-o", out) == 0
     assert names(out) == ["me_light.exr", "me_light.json", "me_light.png", "me_track.jsonl"]
@@ -542,7 +542,7 @@ def test_each_take_has_its_light(given: Path, tmp_path: Path) -> None:
     assert [take["frames"] for take in row["takes"]] == [[0, 1], [2, 3]]
 
 
-def test_people_are_cut_out_of_a_film(given: Path, tmp_path: Path) -> None:
+def test_people_are_cut_out_of_a_video(given: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert main(["segment", str(given / "me.mp4"), "-o", str(out)]) == 0
     mattes = [read_image(out / f"me.{number:04d}_segment.exr").alpha for number in range(FRAMES)]
@@ -552,32 +552,32 @@ def test_people_are_cut_out_of_a_film(given: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        (("{film}", "--light", "0,0", "-o", "{out}.mp4", "--format", "png"), "--format"),
-        (("{film}", "--light", "0,0", "-o", "{out}.mp4", "--background", "none"), "has no alpha"),
-        (("{film}", "--light", "0,0", "-o", "{out}.mp4", "--fps", "25"), "--fps: "),
-        (("{film}", "--light", "0,0", "-o", "{film}"), "is the input"),
-        (("{film}", "--light", "0,0", "-o", "{out}.webm"), "use one of these"),
+        (("{video}", "--light", "0,0", "-o", "{out}.mp4", "--format", "png"), "--format"),
+        (("{video}", "--light", "0,0", "-o", "{out}.mp4", "--background", "none"), "has no alpha"),
+        (("{video}", "--light", "0,0", "-o", "{out}.mp4", "--fps", "25"), "--fps: "),
+        (("{video}", "--light", "0,0", "-o", "{video}"), "is the input"),
+        (("{video}", "--light", "0,0", "-o", "{out}.webm"), "use one of these"),
         (("{photo}", "--light", "0,0", "-o", "{out}.mp4", "--fps", "0"), "--fps"),
         (("{photo}", "--light", "0,0", "-o", "{out}.mp4", "--fps", "1/9999999"), "--fps"),
         (("{photo}", "--light", "0,0", "-o", "{out}.mp4"), "-o "),
-        (("{film}", "--light", "0,0", "-o", "{out}", "--face", "all"), "--face INDEX"),
-        (("{film}", "--light", "20,0;face=0", "-o", "{out}"), "add --face 0"),
-        (("{film}", "--light", "20,0;face=0", "-o", "{out}", "--face", "1"), "add --face 0"),
-        (("{film}", "--light", "0,0", "-o", "{out}", "--geometry", "network"), "--geometry network: "),
-        (("{film}", "--light", "0,0", "-o", "{out}", "--landmarks", "{photo}"), "--landmarks: "),
-        (("{film}", "--light", "0,0", "-o", "{out}", "--shard", "1/2"), "use --jobs"),
+        (("{video}", "--light", "0,0", "-o", "{out}", "--face", "all"), "--face INDEX"),
+        (("{video}", "--light", "20,0;face=0", "-o", "{out}"), "add --face 0"),
+        (("{video}", "--light", "20,0;face=0", "-o", "{out}", "--face", "1"), "add --face 0"),
+        (("{video}", "--light", "0,0", "-o", "{out}", "--geometry", "network"), "--geometry network: "),
+        (("{video}", "--light", "0,0", "-o", "{out}", "--landmarks", "{photo}"), "--landmarks: "),
+        (("{video}", "--light", "0,0", "-o", "{out}", "--shard", "1/2"), "use --jobs"),
     ],
 )
-def test_options_that_a_film_cannot_have(
+def test_options_that_a_video_cannot_have(
     given: Path, tmp_path: Path, line: tuple[str, ...], message: str, capsys: Said
 ) -> None:
-    filled = [part.format(film=given / "me.mp4", photo=PHOTO, out=tmp_path / "out") for part in line]
+    filled = [part.format(video=given / "me.mp4", photo=PHOTO, out=tmp_path / "out") for part in line]
     assert main(["relight", *filled]) == 2
     assert message in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
-def test_a_film_in_a_folder_of_photos_is_left_alone(given: Path, tmp_path: Path, capsys: Said) -> None:
+def test_a_video_in_a_folder_of_photos_is_left_alone(given: Path, tmp_path: Path, capsys: Said) -> None:
     shutil.copy(given / "me.mp4", tmp_path / "live.mp4")
     shutil.copy(PHOTO, tmp_path / "me.jpg")
     assert main(["relight", str(tmp_path), "--light", "0,0", "-o", str(tmp_path / "out"), "--dry-run"]) == 0

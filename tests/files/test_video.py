@@ -1,4 +1,4 @@
-"""Films read by frame, and written with times, sound and metadata."""
+"""Videos read by frame, and written with times, sound and metadata."""
 
 import gc
 import struct
@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.files.film import Film, Timing, film_timing
-from facerf_cli.files.film_writer import write_film
 from facerf_cli.files.read import read_image
+from facerf_cli.files.video import Timing, Video, video_timing
+from facerf_cli.files.video_writer import write_video
 from facerf_cli.files.write import write_display
 from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear, to_linear_rec709
 from tests.files.made import bt2020_of, write_png
 from tests.kinds import Log, Patch
 from tests.refusals import refused
 
-av: Any = pytest.importorskip("av", reason="films need av: pip install 'facerf[video]'")
+av: Any = pytest.importorskip("av", reason="videos need av: pip install 'facerf[video]'")
 PCM = "pcm_s16le"
 COLOURS = np.array([[0.8, 0.3, 0.2], [0.2, 0.6, 0.3], [0.3, 0.3, 0.7], [0.5, 0.5, 0.5], [0.9, 0.8, 0.4]])
 
@@ -39,7 +39,7 @@ def images_of(folder: Path, size: tuple[int, int] = (36, 50), bits: int = 8) -> 
 
 
 def with_sound(path: Path, codec: str, frames: int = 30, rate: int = 25) -> Path:
-    """A grey film with a tone."""
+    """A grey video with a tone."""
     with av.open(str(path), "w") as container:
         pictures = container.add_stream("libvpx-vp9" if path.suffix == ".webm" else "libx264", rate=rate)
         pictures.width, pictures.height, pictures.pix_fmt = 48, 32, "yuv420p"
@@ -62,17 +62,17 @@ def with_sound(path: Path, codec: str, frames: int = 30, rate: int = 25) -> Path
 @pytest.mark.parametrize(("suffix", "kind", "most"), [(".mp4", np.uint8, 255), (".mov", np.uint16, 65535)])
 def test_colours_and_order_come_back(tmp_path: Path, suffix: str, kind: type, most: int) -> None:
     images = images_of(tmp_path, bits=16 if suffix == ".mov" else 8)
-    path = tmp_path / f"film{suffix}"
-    write_film(path, images, Timing.steady(5, Fraction(30000, 1001)), "Synthetic: a test")
+    path = tmp_path / f"video{suffix}"
+    write_video(path, images, Timing.steady(5, Fraction(30000, 1001)), "Synthetic: a test")
     with av.open(str(path)) as container:
         assert container.metadata["comment"] == "Synthetic: a test"
     assert b"Synthetic: a test" in path.read_bytes()  # as a later run looks for it
-    film = Film(path)
-    timing = film.timing
-    assert film.read(0).shape == (36, 50, 3) and len(timing.times_s) == 5 and timing.sound is None
+    video = Video(path)
+    timing = video.timing
+    assert video.read(0).shape == (36, 50, 3) and len(timing.times_s) == 5 and timing.sound is None
     assert timing.rate == Fraction(30000, 1001)
     for number in (3, 0, 4, 1, 2, 2):  # in any order
-        frame = film.read(number)
+        frame = video.read(number)
         assert frame.dtype == kind
         # YCbCr of limited range has steps of 1 / 219 in 8 bits, and H.264 rounds once more
         found, steps = frame[8:-8, 8:-8].mean((0, 1)) / most, 1.6 if most == 255 else 0.6
@@ -80,19 +80,21 @@ def test_colours_and_order_come_back(tmp_path: Path, suffix: str, kind: type, mo
 
 
 def test_an_odd_size_is_made_even_and_uneven_times_are_kept(tmp_path: Path) -> None:
-    path = tmp_path / "film.mp4"
-    write_film(path, images_of(tmp_path, (35, 49)), Timing.steady(5, Fraction(24)), "")
-    film = Film(path)
-    assert film.read(0).shape == (36, 50, 3)
+    path = tmp_path / "video.mp4"
+    write_video(path, images_of(tmp_path, (35, 49)), Timing.steady(5, Fraction(24)), "")
+    video = Video(path)
+    assert video.read(0).shape == (36, 50, 3)
     times_s = tuple(map(Fraction, ("0", "1/30", "1/10", "1/5", "1/2")))
-    write_film(path, images_of(tmp_path), Timing(times_s, Fraction(20)), "")
-    assert [float(time_s) for time_s in film_timing(path).times_s] == pytest.approx(list(map(float, times_s)))
+    write_video(path, images_of(tmp_path), Timing(times_s, Fraction(20)), "")
+    assert [float(time_s) for time_s in video_timing(path).times_s] == pytest.approx(
+        list(map(float, times_s))
+    )
 
 
 @pytest.mark.parametrize("rate", ["24000/1001", "60000/1001", "120000/1001", "25/2", "2997/125", "1/1000"])
 def test_a_rate_is_exact(tmp_path: Path, rate: str) -> None:
-    write_film(tmp_path / "film.mov", images_of(tmp_path)[:3], Timing.steady(3, Fraction(rate)), "")
-    assert film_timing(tmp_path / "film.mov").rate == Fraction(rate)
+    write_video(tmp_path / "video.mov", images_of(tmp_path)[:3], Timing.steady(3, Fraction(rate)), "")
+    assert video_timing(tmp_path / "video.mov").rate == Fraction(rate)
 
 
 @pytest.mark.parametrize(
@@ -117,8 +119,8 @@ def test_timecode_is_kept(
             frame = av.VideoFrame.from_ndarray(np.zeros((32, 48, 3), np.uint8))
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
-    write_film(tmp_path / made, images_of(tmp_path)[:2], film_timing(tmp_path / name), "")
-    found = film_timing(tmp_path / made)
+    write_video(tmp_path / made, images_of(tmp_path)[:2], video_timing(tmp_path / name), "")
+    found = video_timing(tmp_path / made)
     assert (found.timecode, found.rate) == ("" if timecode[0] == "n" else timecode, Fraction(rate))
 
 
@@ -131,10 +133,10 @@ def test_timecode_is_kept(
     ],
 )
 def test_sound_is_kept(tmp_path: Path, source: str, codec: str, made: str, kept: str) -> None:
-    timing = film_timing(with_sound(tmp_path / source, codec))
+    timing = video_timing(with_sound(tmp_path / source, codec))
     images = images_of(tmp_path)
     path = tmp_path / made
-    write_film(path, [images[n % 5] for n in range(len(timing.times_s))], timing, "")
+    write_video(path, [images[n % 5] for n in range(len(timing.times_s))], timing, "")
     with av.open(str(path)) as container:
         (track,) = container.streams.audio
         assert track.codec_context.name == kept
@@ -147,27 +149,27 @@ def test_sound_is_kept(tmp_path: Path, source: str, codec: str, made: str, kept:
     )
 
 
-def test_a_film_that_cannot_be_finished_is_not_there(tmp_path: Path) -> None:
+def test_a_video_that_cannot_be_finished_is_not_there(tmp_path: Path) -> None:
     images = images_of(tmp_path)
     images[3].write_bytes(b"no image")
     with pytest.raises(InputError, match=r"frame\.0003\.png"):
-        write_film(tmp_path / "film.mp4", images, Timing.steady(5, Fraction(24)), "")
-    assert not list(tmp_path.glob("*film*"))
+        write_video(tmp_path / "video.mp4", images, Timing.steady(5, Fraction(24)), "")
+    assert not list(tmp_path.glob("*video*"))
 
 
-def test_what_is_no_film_is_said_in_one_line(tmp_path: Path) -> None:
-    (tmp_path / "text.mp4").write_text("no film at all\n" * 50)
-    refused(InputError, "text.mp4: ... not a readable video", film_timing, tmp_path / "text.mp4")
+def test_what_is_no_video_is_said_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "text.mp4").write_text("no video at all\n" * 50)
+    refused(InputError, "text.mp4: ... not a readable video", video_timing, tmp_path / "text.mp4")
     with av.open(str(tmp_path / "tone.mp4"), "w") as container:
         tone = container.add_stream("aac", rate=48000, layout="mono")
         frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), "fltp", "mono")
         frame.sample_rate = 48000
         container.mux(tone.encode(frame))
         container.mux(tone.encode(None))
-    refused(InputError, "tone.mp4: has no video", film_timing, tmp_path / "tone.mp4")
+    refused(InputError, "tone.mp4: has no video", video_timing, tmp_path / "tone.mp4")
 
 
-def test_a_film_in_hdr_is_refused(tmp_path: Path) -> None:
+def test_a_video_in_hdr_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "hdr.mp4"
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=24)
@@ -176,10 +178,10 @@ def test_a_film_in_hdr_is_refused(tmp_path: Path) -> None:
         frame = av.VideoFrame.from_ndarray(np.zeros((32, 48, 3), np.uint8))
         container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
-    refused(InputError, "hdr.mp4: HDR (HLG)", film_timing, path)
+    refused(InputError, "hdr.mp4: HDR (HLG)", video_timing, path)
 
 
-def coded_film(
+def coded_video(
     path: Path, levels: np.ndarray, sar: str = "1", turn: tuple[int, ...] = (), **codes: int
 ) -> Path:
     """Two frames of levels [H, W, 3]; `turn` is a, b, c, d of the display matrix."""
@@ -207,10 +209,10 @@ SHOWN = QUARTERS.repeat(32, 0).repeat(48, 1)
 
 
 def quarters_of(path: Path) -> tuple[np.ndarray, tuple[int, ...]]:
-    """The levels of the quarters, decoded by the film's space and encoded as sRGB; and the frame's shape."""
-    film = Film(path)
-    frame = film.read(0)
-    linear = to_linear_rec709(frame, film.space)
+    """The levels of the quarters, decoded by the video's space and encoded as sRGB; and the frame's shape."""
+    video = Video(path)
+    frame = video.read(0)
+    linear = to_linear_rec709(frame, video.space)
     height, width = frame.shape[:2]
     at = np.s_[height // 4 :: height // 2, width // 4 :: width // 2]
     return 255 * linear_to_srgb(linear[at]), frame.shape[:2]
@@ -218,7 +220,7 @@ def quarters_of(path: Path) -> tuple[np.ndarray, tuple[int, ...]]:
 
 @pytest.mark.parametrize(("sar", "size"), [("2", (64, 192)), ("1/2", (128, 96)), ("4/3", (64, 128))])
 def test_samples_become_square(tmp_path: Path, sar: str, size: tuple[int, int]) -> None:
-    found, shape = quarters_of(coded_film(tmp_path / "a.mp4", SHOWN, sar))
+    found, shape = quarters_of(coded_video(tmp_path / "a.mp4", SHOWN, sar))
     assert shape == size
     np.testing.assert_allclose(found, QUARTERS, atol=4)
 
@@ -235,24 +237,24 @@ def test_samples_become_square(tmp_path: Path, sar: str, size: tuple[int, int]) 
 )
 def test_display_matrices(tmp_path: Path, turn: tuple[int, ...], expected: np.ndarray) -> None:
     """Mirrored either way, turned either way, and both."""
-    found, shape = quarters_of(coded_film(tmp_path / "a.mp4", SHOWN, turn=turn))
+    found, shape = quarters_of(coded_video(tmp_path / "a.mp4", SHOWN, turn=turn))
     np.testing.assert_allclose(found, expected, atol=4)
     assert shape == ((96, 64) if turn[0] == 0 else (64, 96))
 
 
-def test_codes_of_a_film(tmp_path: Path) -> None:
+def test_codes_of_a_video(tmp_path: Path) -> None:
     """BT.709 holds display values, as frames of it with cICP do; BT.2020 has its primaries and its curve."""
-    plain = coded_film(tmp_path / "a.mp4", SHOWN, color_primaries=1, color_trc=1)
+    plain = coded_video(tmp_path / "a.mp4", SHOWN, color_primaries=1, color_trc=1)
     np.testing.assert_allclose(quarters_of(plain)[0], QUARTERS, atol=4)
     stored = np.round(255 * bt2020_of(srgb_to_linear(SHOWN / np.float32(255)))).astype(np.uint8)
-    wide = coded_film(tmp_path / "b.mp4", stored, color_primaries=9, color_trc=14)
+    wide = coded_video(tmp_path / "b.mp4", stored, color_primaries=9, color_trc=14)
     np.testing.assert_allclose(quarters_of(wide)[0], QUARTERS, atol=7)
     frame = write_png(tmp_path / "frame.png", SHOWN, (b"cICP", bytes([1, 1, 0, 1])))
     assert read_image(frame).pixels == pytest.approx(srgb_to_linear(SHOWN / np.float32(255)), abs=1e-6)
 
 
-def film_of(path: Path, codec: str, form: str, frames: list[np.ndarray], **options: str) -> Path:
-    """A film of RGB or RGBA frames in uint8, by a codec and a pixel format of FFmpeg."""
+def video_of(path: Path, codec: str, form: str, frames: list[np.ndarray], **options: str) -> Path:
+    """A video of RGB or RGBA frames in uint8, by a codec and a pixel format of FFmpeg."""
     muxer = "mpegts" if path.suffix == ".mts" else "mp4" if path.suffix == ".m4v" else None
     with av.open(str(path), "w", format=muxer) as container:
         stream = container.add_stream(codec, rate=25, options=options)
@@ -282,8 +284,8 @@ def bands() -> np.ndarray:
 def test_alpha_is_read(tmp_path: Path, name: str, codec: str, form: str) -> None:
     """White is white in any number of bits, and the colour under alpha stays."""
     options = {"profile": "4"} if codec == "prores_ks" else {}
-    film = Film(film_of(tmp_path / name, codec, form, [bands()] * 3, **options))
-    frame = film.read(2)
+    video = Video(video_of(tmp_path / name, codec, form, [bands()] * 3, **options))
+    frame = video.read(2)
     most = np.iinfo(frame.dtype).max
     assert most == (65535 if "10" in form else 255)
     found = frame[:, [4, 40, 92], 3] / most
@@ -297,13 +299,13 @@ def test_alpha_is_written(tmp_path: Path) -> None:
     """ProRes 4444 keeps it, and H.264 shows the image over black, as a JPEG does."""
     image = write_png(tmp_path / "a.png", bands())
     for name in ("a.mov", "a.mp4"):
-        write_film(tmp_path / name, [image], Timing.steady(1, Fraction(24)), "")
-    film = Film(tmp_path / "a.mov")
-    kept = film.read(0) / 65535
+        write_video(tmp_path / name, [image], Timing.steady(1, Fraction(24)), "")
+    video = Video(tmp_path / "a.mov")
+    kept = video.read(0) / 65535
     np.testing.assert_allclose(kept[:, [8, 40, 88], 3], [[0, 128 / 255, 1]] * 64, atol=1 / 1023)
     np.testing.assert_allclose(kept[16::32, 24::48, :3], QUARTERS / 255, atol=4 / 255)
-    film = Film(tmp_path / "a.mp4")
-    shown = film.read(0) / 255
+    video = Video(tmp_path / "a.mp4")
+    shown = video.read(0) / 255
     alpha = np.array([0, 128 / 255, 1])
     expected = linear_to_srgb(srgb_to_linear(SHOWN[:, [8, 40, 88]] / 255) * alpha[:, None])
     np.testing.assert_allclose(shown[8:24, [8, 40, 88]], expected[8:24], atol=4 / 255)
@@ -323,10 +325,10 @@ def test_interlaced_frames_become_progressive(tmp_path: Path, name: str) -> None
     """Both rows show the time of the field that is first, in any order of reading."""
     frames = [bars(number, 1) for number in range(11)]
     coded = {"x264-params": "interlaced=1", "crf": "1", "g": "4"}
-    path = film_of(tmp_path / name, "libx264", "yuv420p", frames, **coded)
-    film = Film(path)
-    assert len(film.timing.times_s) == 11
-    read = [film.read(number) for number in range(11)]
+    path = video_of(tmp_path / name, "libx264", "yuv420p", frames, **coded)
+    video = Video(path)
+    assert len(video.timing.times_s) == 11
+    read = [video.read(number) for number in range(11)]
     for number, frame in enumerate(read):
         inside = np.s_[4:60]  # at the edge of the first frame bwdif has too little to go by
         np.testing.assert_allclose(frame[inside], bars(number, 0)[inside], atol=5)
@@ -339,15 +341,15 @@ def test_interlaced_frames_are_the_same_in_any_order_and_progressive_ones_not_fi
     noise = np.random.default_rng(8).integers(0, 256, (2, 32, 48, 1), np.uint8)
     frames = list(noise.repeat(3, 3).repeat(3, 0).repeat(2, 1).repeat(2, 2))
     coded = {"x264-params": "interlaced=1:scenecut=0:bframes=0", "g": "3"}
-    path = film_of(tmp_path / "a.mp4", "libx264", "yuv420p", frames, **coded)
-    film = Film(path)
-    other = Film(path)
-    inside = [film.read(number) for number in range(6)]
+    path = video_of(tmp_path / "a.mp4", "libx264", "yuv420p", frames, **coded)
+    video = Video(path)
+    other = Video(path)
+    inside = [video.read(number) for number in range(6)]
     np.testing.assert_array_equal(other.read(3), inside[3])
     assert np.abs(inside[3].astype(int) - inside[4]).max() > 9  # what is before counts
     frames = [bars(number, 1) for number in range(3)]  # combs that nothing states
-    film = Film(film_of(tmp_path / "a.mp4", "libx264", "yuv444p", frames, crf="1"))
-    np.testing.assert_allclose(film.read(1), frames[1], atol=5)
+    video = Video(video_of(tmp_path / "a.mp4", "libx264", "yuv444p", frames, crf="1"))
+    np.testing.assert_allclose(video.read(1), frames[1], atol=5)
 
 
 @pytest.mark.parametrize(
@@ -365,30 +367,30 @@ def test_interlaced_frames_are_the_same_in_any_order_and_progressive_ones_not_fi
 def test_containers(tmp_path: Path, name: str, codec: str, form: str) -> None:
     """Frames with references to later ones, in their order and at their times, from the first to the last."""
     frames = [np.full((64, 96, 3), 12 * number, np.uint8) for number in range(20)]
-    path = film_of(tmp_path / name, codec, form, frames, bf="2", g="6", b="4M")
-    film = Film(path)
-    assert film.timing.times_s == tuple(Fraction(number, 25) for number in range(20))
+    path = video_of(tmp_path / name, codec, form, frames, bf="2", g="6", b="4M")
+    video = Video(path)
+    assert video.timing.times_s == tuple(Fraction(number, 25) for number in range(20))
     for number in (*range(20), 19, 7, 0, 13):
-        assert film.read(number).mean() == pytest.approx(12 * number, abs=4)
+        assert video.read(number).mean() == pytest.approx(12 * number, abs=4)
 
 
 def test_frames_are_decoded_in_order_by_few_readers(tmp_path: Path, monkeypatch: Patch) -> None:
     """Key frames, the middle and all frames of each take, in turn, take three passes in all."""
     frames = [np.full((64, 96, 3), 3 * number, np.uint8) for number in range(80)]
-    film = Film(film_of(tmp_path / "a.mp4", "libx264", "yuv420p", frames, bf="2", g="6"))
-    passes, decoded = [], film._decoded
-    monkeypatch.setattr(film, "_decoded", lambda: passes.append(1) or decoded())
+    video = Video(video_of(tmp_path / "a.mp4", "libx264", "yuv420p", frames, bf="2", g="6"))
+    passes, decoded = [], video._decoded
+    monkeypatch.setattr(video, "_decoded", lambda: passes.append(1) or decoded())
     for take in (range(40), range(40, 80)):
         for number in (*take[::10], take.start + 20, *take):
             for near in (number, max(number - 4, take.start), min(number + 2, take.stop - 1)):
-                assert film.read(near).mean() == pytest.approx(3 * near, abs=2.5)
-            assert len(film._kept) <= 12
+                assert video.read(near).mean() == pytest.approx(3 * near, abs=2.5)
+            assert len(video._kept) <= 12
     assert len(passes) == 3
     gc.collect()
     gc.disable()
     held = 0
     for number in range(80):
-        film.read(number)
+        video.read(number)
         held = max(held, sum(type(one) is av.VideoFrame for one in gc.get_objects()))
     gc.enable()
     assert held < 40, "frames are let go at once"
@@ -417,7 +419,7 @@ def with_sounds(path: Path, tones: list[tuple[str, int, float, float]], late_s: 
 
 
 def heard(path: Path) -> list[tuple[str, int, str | None, float, float]]:
-    """Codec, rate, language, frequency and length of each tone of a film."""
+    """Codec, rate, language, frequency and length of each tone of a video."""
     found = []
     with av.open(str(path)) as container:
         count = len(container.streams.audio)
@@ -447,8 +449,8 @@ def test_all_sound_is_kept(
     tmp_path: Path, tones: list[tuple[str, int, float, float]], made: str, codecs: list[tuple[str, int]]
 ) -> None:
     """Every track, as long as it is, at a rate that the codec takes."""
-    timing, path = film_timing(with_sounds(tmp_path / "a.mov", tones)), tmp_path / made
-    write_film(path, images_of(tmp_path)[:2], timing, "")
+    timing, path = video_timing(with_sounds(tmp_path / "a.mov", tones)), tmp_path / made
+    write_video(path, images_of(tmp_path)[:2], timing, "")
     found = heard(path)
     assert [one[:2] for one in found] == codecs
     assert [one[2] for one in found] == ["eng", "ger"][: len(tones)]
@@ -458,12 +460,12 @@ def test_all_sound_is_kept(
 
 
 @pytest.mark.parametrize("codec", ["aac", "pcm_s16le"])
-def test_a_film_that_begins_late(tmp_path: Path, codec: str) -> None:
+def test_a_video_that_begins_late(tmp_path: Path, codec: str) -> None:
     """Cut out of another, at 2 s: it begins at 0, and its sound with it."""
     source = with_sounds(tmp_path / "a.mkv", [(codec, 48000, 440, 1.0)], late_s=2)
-    timing = film_timing(source)
+    timing = video_timing(source)
     assert timing.times_s == (0, Fraction(1, 25))
-    write_film(tmp_path / "b.mp4", images_of(tmp_path)[:2], timing, "")
+    write_video(tmp_path / "b.mp4", images_of(tmp_path)[:2], timing, "")
     with av.open(str(tmp_path / "b.mp4")) as container:
         starts = [float(stream.start_time * stream.time_base) for stream in container.streams]
     assert starts == pytest.approx([0, 0], abs=0.03)  # a frame of AAC
@@ -475,11 +477,11 @@ def test_sound_of_unknown_codecs_is_omitted_with_a_warning(tmp_path: Path, caplo
     data[at : at + 4], config = b"apac", data.index(b"esds", at)
     data[config : config + 4] = b"free"
     (tmp_path / "b.mp4").write_bytes(data)
-    write_film(tmp_path / "out.mp4", images_of(tmp_path)[:2], film_timing(tmp_path / "b.mp4"), "")
+    write_video(tmp_path / "out.mp4", images_of(tmp_path)[:2], video_timing(tmp_path / "b.mp4"), "")
     assert "b.mp4: a sound track has an unknown codec" in caplog.text
     assert len(heard(tmp_path / "out.mp4")) == 1
 
 
 def test_without_av_one_line_says_what_to_install(monkeypatch: Patch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
-    refused(UsageError, "pip install 'facerf[video]'", film_timing, tmp_path / "a.mp4")
+    refused(UsageError, "pip install 'facerf[video]'", video_timing, tmp_path / "a.mp4")

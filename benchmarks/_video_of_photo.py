@@ -1,11 +1,11 @@
-"""Frames of a film; of a photo, those of a camera that pans and zooms by less than a pixel a frame."""
+"""Frames of a video; of a photo, those of a camera that pans and zooms by less than a pixel a frame."""
 
 from pathlib import Path
 
 import numpy as np
 from skimage.transform import SimilarityTransform, warp
 
-from facerf_cli.batch.inputs import FILM_SUFFIXES
+from facerf_cli.batch.inputs import VIDEO_SUFFIXES
 from facerf_cli.files.read import read_image
 from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear
 from facerf_cli.image.strips import fitted, resized
@@ -17,11 +17,11 @@ SEED = 101
 
 def frames_of(path: Path, count: int) -> list[np.ndarray]:
     """At most `count` scene-linear frames [H, W, 3]."""
-    if path.suffix.lower() in FILM_SUFFIXES:
-        from facerf_cli.files.film import Film
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        from facerf_cli.files.video import Video
 
-        film = Film(path)
-        coded = [film.read(n) for n in range(min(count, len(film.timing.times_s)))]
+        video = Video(path)
+        coded = [video.read(n) for n in range(min(count, len(video.timing.times_s)))]
         return [np.asarray(srgb_to_linear(x[..., :3] / np.iinfo(x.dtype).max), np.float32) for x in coded]
     photo = read_image(path).pixels
     photo = resized(photo, *fitted(*photo.shape[:2], SIDE_PX)) if max(photo.shape[:2]) > SIDE_PX else photo
