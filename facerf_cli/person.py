@@ -227,8 +227,8 @@ class Person:
         if not alone and pose is None:
             return self._group.relight(light, background, layers, room)
         lights = _lights_of(light, room)
-        if any(one.own_rgb is not None for one in lights):
-            raise UsageError("Light.own(): lights the whole photo; remove pose and alone")
+        if any(one.original_rgb is not None for one in lights):
+            raise UsageError("Light.original(): lights the whole photo; remove pose and alone")
         _check_layers(layers, FACE_LAYERS)
         images = self._images_of_face(lights, pose, layers)
         return self._images_for_caller(light, lights, [pose, self._texture_requiring_grad], images, layers)
@@ -290,9 +290,9 @@ class Person:
         return self._to_caller_type(behind[0 : size[0]], envmap)
 
     @property
-    def even(self) -> Light:
+    def delight(self) -> Light:
         """Uniform light that reproduces the brightness of the skin in the photo."""
-        return self.uniform_intensity * Light.around()
+        return self.uniform_intensity * Light.uniform()
 
     @cached_property
     def light(self) -> Light:
@@ -463,7 +463,7 @@ class Person:
         layers: Sequence[str],
     ) -> Any:
         """Return the result for a light, or a list for a list; `inputs` are what else gradients may reach."""
-        inputs = [*inputs, *(array for one in lights for array in (one.directions, one.weights, one.own_rgb))]
+        inputs = [*inputs, *_arrays_of(lights)]
         with _grad_for_tensors(*inputs):
             each = [
                 {name: self._to_caller_type(values, *inputs) for name, values in image.items()}
@@ -522,8 +522,8 @@ class Group:
     ) -> Any:
         """Relight all people with the same light and return one image; see `Person.relight`."""
         lights, kinds = _lights_of(light, room), {person.kind for person in self.people}
-        if not kinds <= {"portrait", "field"} and any(one.own_rgb is not None for one in lights):
-            raise UsageError("Light.own(): not supported by the comparison models; use reflectance='field'")
+        if not kinds <= {"portrait", "field"} and any(one.original_rgb is not None for one in lights):
+            raise UsageError("Light.original(): unsupported by comparison models; use reflectance='field'")
         _check_layers(layers, [*FACE_LAYERS, *(PERSON_LAYERS if kinds == {"portrait"} else ())])
         _refuse_gradients(lights, self.people)
         with torch.no_grad():
@@ -572,6 +572,11 @@ def _lights_of(light: Any, room: float) -> list[Light]:
     return [as_light(one, room) for one in (light if isinstance(light, Sequence) else [light])]
 
 
+def _arrays_of(lights: Sequence[Light]) -> list[Any]:
+    """Return the arrays of lights through which gradients may flow."""
+    return [array for one in lights for array in (one.directions, one.weights, one.original_rgb)]
+
+
 def _check_layers(layers: Sequence[str], known: Sequence[str]) -> None:
     if isinstance(layers, str) or not set(layers) <= set(known):
         raise ValueError(f"layers is {layers!r}, not a list of some of {', '.join(dict.fromkeys(known))}")
@@ -579,7 +584,7 @@ def _check_layers(layers: Sequence[str], known: Sequence[str]) -> None:
 
 def _refuse_gradients(lights: Sequence[Light], people: Sequence[Person]) -> None:
     """Raise UsageError if a gradient through an image in the photo is requested."""
-    inputs = [array for one in lights for array in (one.directions, one.weights, one.own_rgb)]
+    inputs = _arrays_of(lights)
     for person in people:
         inputs.append(person.face.texture)
         networks: Any = person.models.networks  # all are loaded by now

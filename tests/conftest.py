@@ -29,7 +29,7 @@ test_paper_script.py test_docs_commands.py cli/test_video.py cli/test_relight.py
 run/test_ray_workers.py viewer/test_viewer_agreement.py cli/test_predict_olat.py test_gradients.py
 cli/test_prepare_dataset.py cli/test_estimate_light.py cli/test_output_options.py cli/test_person.py
 cli/test_relight_reflectance.py cli/test_evaluate_protocols.py test_main.py cli/test_synth_stage.py
-portrait/test_person.py cli/test_own.py relighting/test_portrait_field.py
+portrait/test_person.py cli/test_original.py relighting/test_portrait_field.py
 cli/test_relight_dataset.py cli/test_segment.py training/test_loop.py relighting/test_reflectance.py
 relighting/test_near_lights.py test_python_api.py cli/test_room.py relighting/test_white.py
 cli/test_evaluate_yale_b.py relighting/test_photo_light.py cli/test_prepare_checks.py

@@ -159,7 +159,7 @@ def test_images_in_the_photo_have_no_gradients_and_say_so(
     each = {
         "weights": (person, facerf.Light(directions, weights.clone().requires_grad_())),
         "directions": (person, facerf.Light(directions.clone().requires_grad_(), weights)),
-        "own": (person, facerf.Light.own() * torch.ones((), requires_grad=True)),
+        "original": (person, facerf.Light.original() * torch.ones((), requires_grad=True)),
         "texture": (person.with_texture(torch.from_numpy(person.texture).requires_grad_()), plain),
     }
     for one, lit in each.values():

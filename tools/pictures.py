@@ -44,7 +44,7 @@ COMMANDS = {
     "sheet": {
         f"relight {{photo}} --background envmap --envmap {LOW_SUN} {STAGE}": "low_sun.png stage.png",
         "relight {photo} --light=-60,20": "light_-60_20.png",
-        "relight {photo} --light=own --light=rim=145,15,10": "light_own+rim.png",
+        "relight {photo} --light=original --light=rim=145,15,10": "light_original+rim.png",
         "segment {photo}": "person.png",
     },
     "well": {

@@ -23,7 +23,8 @@ _MOST_DIGITS = 9  # of a count; Python refuses to parse thousands of digits
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 _RIGS = Path(__file__).parents[1] / "assets" / "rigs"
 ROOM_BEFORE_BRIGHT, ROOM_BEFORE_DARK = 0.06, 0.03  # ambient fill per sum of the lights, by the background
-OWN, EVEN = "own", "even"  # the photo's original light; uniform light of the same brightness
+ORIGINAL, DELIGHT = "original", "delight"  # the photo's light; uniform light of the same brightness
+_RENAMED = {"own": ORIGINAL, "even": DELIGHT, "around": "uniform"}
 _DISTANCE_M = (0.15, 1e4)  # range of a near light's distance from the face
 
 
@@ -37,9 +38,9 @@ class StudioLight:
 
     Axes are those of the camera. A far light has a direction `azel_deg` (azimuth, elevation), a near light a
     position `at_m` in metres from the face's centre. A lat-long map has `rotate_deg` added to every azimuth.
-    `own` is the photo's original light, which reproduces the photo. Without any of these the light is
+    `original` is the photo's original light, which reproduces the photo. Without any of these the light is
     uniform, as in a room or under an overcast sky: every unoccluded surface receives the same irradiance.
-    With `even`, its intensity reproduces the skin's brightness in the photo.
+    With `delight`, its intensity reproduces the skin's brightness in the photo.
 
     `rgb` is multiplied by the colour of a blackbody of `kelvin` and by 2 to the power of `stops`. At the
     face's centre a near light has the irradiance of a far light of the same colour; a map's radiance is
@@ -59,13 +60,13 @@ class StudioLight:
     envmap: Path | None = None
     rotate_deg: float = 0.0
     face: int | None = None
-    own: bool = False
-    even: bool = False
+    original: bool = False
+    delight: bool = False
 
     @property
-    def is_around(self) -> bool:
+    def is_uniform(self) -> bool:
         """Whether the light is uniform."""
-        return self.azel_deg is None and self.at_m is None and self.envmap is None and not self.own
+        return self.azel_deg is None and self.at_m is None and self.envmap is None and not self.original
 
 
 WORDS = {
@@ -75,9 +76,9 @@ WORDS = {
     "below": StudioLight((0.0, -90.0)),
     "behind": StudioLight((180.0, 0.0)),
     "front": StudioLight((0.0, 0.0)),
-    "around": StudioLight(),
-    OWN: StudioLight(own=True),
-    EVEN: StudioLight(even=True),
+    "uniform": StudioLight(),
+    ORIGINAL: StudioLight(original=True),
+    DELIGHT: StudioLight(delight=True),
 }
 
 
@@ -209,7 +210,7 @@ def light_by_keys(
         raise UsageError(f"{where} {typed}: a light needs one place; use at=X,Y,Z, from=AZ,EL or map=FILE")
     placed = rig or _placed(places[0], settings[places[0]], where)
     first = placed.frames[0][0]
-    kind = "" if rig or first.is_around or first.own else _PLACES[places[0]]
+    kind = "" if rig or first.is_uniform or first.original else _PLACES[places[0]]
     fields: dict[str, Any] = {}
     for key, (form, (least, most), field, applies_to) in _NUMBERS.items():
         if key not in settings:
@@ -254,6 +255,8 @@ def _far(text: str, where: str) -> LitImage:
     """Parse a word, or a direction with an optional strength; swept angles have equal frame counts."""
     if text in WORDS:
         return LitImage(((WORDS[text],),), name=text)
+    if text in _RENAMED:
+        raise UsageError(f"{where} {text!r}: no such light; use {_RENAMED[text]}")
     if _NAME.fullmatch(text):
         raise UsageError(f"{where} {text!r}: no such direction; use AZ,EL or one of {', '.join(WORDS)}")
     parts = text.split(",")
@@ -300,7 +303,7 @@ def _entry(text: str) -> tuple[list[LitImage], str | None]:
     places: list[tuple[str | None, str | None]] = []
     for key, value in _pairs(text):
         if key is None or key not in ("name", *KEYS, *_REMOVED):
-            is_known = value in (*WORDS, *preset_names()) or value.endswith(".toml")
+            is_known = value in (*WORDS, *_RENAMED, *preset_names()) or value.endswith(".toml")
             if not is_known and "," not in value:
                 part = value if key is None else f"{key}={value}"
                 known = f"AZ,EL, a rig file (.toml) or one of {', '.join((*preset_names(), *WORDS))}"
@@ -318,10 +321,10 @@ def _entry(text: str) -> tuple[list[LitImage], str | None]:
         if places[0][0] is not None:
             raise UsageError(f"{where} the light has two names; remove name=")
         places = [(settings.pop("name"), places[0][1])]
-    places = [
-        (word if name is None and (word := place or settings.get("from")) in (OWN, EVEN) else name, place)
-        for name, place in places
-    ]
+    for number, (name, place) in enumerate(places):
+        word = place or settings.get("from")
+        if name is None and word in (ORIGINAL, DELIGHT):
+            places[number] = (word, place)
     lights = []
     for name, place in places:
         is_rig = place is not None and (place in preset_names() or place.endswith(".toml"))
@@ -371,8 +374,8 @@ def _rig(preset_or_file: str) -> LitImage:
 
 def _together(image: str, lights: Sequence[LitImage], where: str) -> LitImage:
     """Put lights into one image; those without a sweep shine in every frame of those with one."""
-    if sum(one.own for light in lights for one in light.frames[0]) > 1:
-        raise UsageError(f"{where} the photo's own light ({OWN}) occurs twice; use it once")
+    if sum(one.original for light in lights for one in light.frames[0]) > 1:
+        raise UsageError(f"{where} the original light occurs twice; use it once")
     names = tuple(name for light in lights for name in light.names)
     for name in names:
         if not _NAME.fullmatch(name) or names.count(name) > 1:

@@ -32,7 +32,7 @@ Rgb = tuple[float, float, float]
 WHITE_K = 6504.0  # correlated colour temperature of D65
 _UNIT = 1e-3  # tolerance of the length of a unit direction
 _APART_DEG, _MOST_A_SIDE = 6.0, 6  # spacing and number of samples along a panel's side, seen from the face
-_AROUND = 24  # samples of uniform light
+_UNIFORM = 24  # samples of uniform light
 _NEAREST_M = 0.05  # distance below which irradiance stops growing
 _FULL_CONE = 0.8  # fraction of a spot's cone with full irradiance, which then falls to 0
 _WIDEST_DEG = 36.0  # angular side of a light from which its shadows have no hard edges
@@ -44,17 +44,17 @@ class Light:
 
     Directions are in camera space. A light of weight 1 gives a white Lambertian surface that faces it
     radiance 1. Lights add and scale: `2 * key + sum(rims)`. If an array is a tensor, gradients flow to it.
-    `own_rgb` [3], if not None, is the factor of the photo's original light. `keys` are ranges of lights: each
-    range holds the samples of a light whose shadows have hard edges. `near` lights have rgb weights
+    `original_rgb` [3], if not None, is the factor of the photo's original light. `keys` are ranges of lights:
+    each range holds the samples of a light whose shadows have hard edges. `near` lights have rgb weights
     `near_weights` [J, 3] at the face's centre.
 
-    Renderers use M sums of the same lights as tensors (`stacked`): weights [M, L, 3], own_rgb [M, 3],
+    Renderers use M sums of the same lights as tensors (`stacked`): weights [M, L, 3], original_rgb [M, 3],
     near_weights [M, J, 3].
     """
 
     directions: Any
     weights: Any
-    own_rgb: Any = None
+    original_rgb: Any = None
     keys: tuple[slice, ...] = ()
     near: tuple[StudioLight, ...] = ()
     near_weights: Any = None
@@ -78,13 +78,13 @@ class Light:
         return Light(direction.numpy()[None], np.array([rgb], np.float32), keys=(slice(0, 1),))
 
     @staticmethod
-    def around(rgb: Rgb = (1.0, 1.0, 1.0)) -> "Light":
+    def uniform(rgb: Rgb = (1.0, 1.0, 1.0)) -> "Light":
         """Return uniform light; it lights a white surface as much as a single light that it faces."""
         directions, weights = far_samples(StudioLight())
         return Light(directions.numpy(), weights[:, None].numpy() * np.array(rgb, np.float32))
 
     @staticmethod
-    def own(rgb: Rgb | Array = (1.0, 1.0, 1.0)) -> "Light":
+    def original(rgb: Rgb | Array = (1.0, 1.0, 1.0)) -> "Light":
         """Return the photo's original light, which reproduces the photo; other lights add to it."""
         nothing = np.zeros((0, 3), np.float32)
         return Light(nothing, nothing, rgb if isinstance(rgb, Tensor) else np.array(rgb, np.float32))
@@ -124,9 +124,9 @@ class Light:
         return Light.from_envmap(guess.envmap.numpy(), lights=lights)
 
     def to_envmap(self, height: int = 256) -> np.ndarray:
-        """Convert to a lat-long map [height, 2 height, 3]; raises UsageError for the photo's own light."""
-        if self.own_rgb is not None:
-            raise UsageError("to_envmap: the photo's own light has no directions; use person.light")
+        """Convert to a lat-long map [height, 2 height, 3]; raises UsageError for the original light."""
+        if self.original_rgb is not None:
+            raise UsageError("to_envmap: the original light has no directions; use person.light")
         light = RigLight(*(values.detach() for values in self._tensors()))
         return rig_to_latlong(light, height).numpy()
 
@@ -137,7 +137,7 @@ class Light:
         return Light(
             _joined(self.directions, other.directions),
             _joined(self.weights, other.weights),
-            _either(self.own_rgb, other.own_rgb, lambda one, two: one + two),
+            _either(self.original_rgb, other.original_rgb, lambda one, two: one + two),
             self.keys + tuple(slice(first + key.start, first + key.stop) for key in other.keys),
             self.near + other.near,
             _either(self.near_weights, other.near_weights, _joined),
@@ -155,8 +155,8 @@ class Light:
             values = as_tensor(values).to(factor.device) if isinstance(factor, Tensor) else values
             return values * (np.array(factor, np.float32) if isinstance(factor, tuple) else factor)
 
-        own, near = scaled(self.own_rgb), scaled(self.near_weights)
-        return Light(self.directions, scaled(self.weights), own, self.keys, self.near, near)
+        original, near = scaled(self.original_rgb), scaled(self.near_weights)
+        return Light(self.directions, scaled(self.weights), original, self.keys, self.near, near)
 
     __rmul__ = __mul__
 
@@ -171,8 +171,8 @@ class Light:
 
     def some(self, sums: slice) -> "Light":
         """Select sums, with only the near lights that contribute to them."""
-        own = None if self.own_rgb is None else self.own_rgb[sums]
-        selected = replace(self, weights=self.weights[sums], own_rgb=own)
+        original = None if self.original_rgb is None else self.original_rgb[sums]
+        selected = replace(self, weights=self.weights[sums], original_rgb=original)
         if self.near_weights is None:
             return selected
         near_weights = self.near_weights[sums]
@@ -181,9 +181,9 @@ class Light:
         return replace(selected, near=near, near_weights=near_weights[:, used])
 
     @property
-    def owns(self) -> Sequence[Tensor | None]:
+    def original_rgbs(self) -> Sequence[Tensor | None]:
         """Rgb factor [3] of the photo's original light in each sum, or None."""
-        return [None] * len(self.weights) if self.own_rgb is None else list(self.own_rgb)
+        return [None] * len(self.weights) if self.original_rgb is None else list(self.original_rgb)
 
     def with_keys_alone(self) -> tuple["Light", list["KeyLight"]]:
         """Append a sum for each key light that shines together with other lights; also return the keys.
@@ -231,8 +231,8 @@ class Light:
         total = self.weights.sum(1)
         if self.near_weights is not None:
             total = total + self.near_weights.sum(1)
-        if self.own_rgb is not None:
-            total = total + self.own_rgb
+        if self.original_rgb is not None:
+            total = total + self.original_rgb
         return [float(value) for value in luminance(total.numpy())]
 
 
@@ -244,7 +244,7 @@ def as_light(light: Any, room: float = 0.0) -> Light:
     if not (isinstance(room, (int, float)) and 0 <= room <= 1):
         raise ValueError(f"room is {room!r}, not a fraction from 0 to 1")
     if isinstance(light, Light):
-        return light + Light.around() * (room * light.weights.sum(0)) if room else light
+        return light + Light.uniform() * (room * light.weights.sum(0)) if room else light
     if isinstance(light, np.ndarray | Tensor) and light.ndim == 3:
         return Light.from_envmap(light)
     kind = f"has shape {list(light.shape)}" if hasattr(light, "shape") else f"is {type(light).__name__}"
@@ -254,13 +254,14 @@ def as_light(light: Any, room: float = 0.0) -> Light:
 def stacked(lights: Sequence[Light]) -> Light:
     """Combine far lights into M sums over the same directions; equal directions become one light."""
     assert not any(light.near for light in lights)
-    own, each = None, [light._tensors() for light in lights]
-    if any(light.own_rgb is not None for light in lights):
-        own = torch.stack([as_tensor(np.zeros(3) if one.own_rgb is None else one.own_rgb) for one in lights])
+    original, each = None, [light._tensors() for light in lights]
+    if any(light.original_rgb is not None for light in lights):
+        factors = [np.zeros(3) if one.original_rgb is None else one.original_rgb for one in lights]
+        original = torch.stack(list(map(as_tensor, factors)))
         dark = torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, 3)
         each = [one if len(one[0]) else dark for one in each]
     if len(each) == 1:
-        return Light(each[0][0], each[0][1][None], own, lights[0].keys)
+        return Light(each[0][0], each[0][1][None], original, lights[0].keys)
     counts = [len(directions) for directions, _ in each]
     directions = torch.cat([directions for directions, _ in each])
     places = torch.arange(len(directions))
@@ -271,7 +272,7 @@ def stacked(lights: Sequence[Light]) -> Light:
     weights = torch.stack([nothing.index_add(0, some, rgb) for some, (_, rgb) in zip(at, each, strict=True)])
     pairs = zip(lights, at, strict=True)
     sharp = {int(number) for light, some in pairs for key in light.keys for number in some[key]}
-    return Light(directions, weights, own, tuple(slice(key, key + 1) for key in sorted(sharp)))
+    return Light(directions, weights, original, tuple(slice(key, key + 1) for key in sorted(sharp)))
 
 
 class KeyLight(NamedTuple):
@@ -338,8 +339,8 @@ class PointLights:
 def far_samples(light: StudioLight) -> tuple[Tensor, Tensor]:
     """Return a far light's sample directions [n, 3] and weights [n]; a surface that faces it receives 1."""
     if light.azel_deg is None:
-        weight = 4 / _AROUND  # the mean of a clamped cosine over the sphere is 1 / 4
-        return rig_directions(_AROUND), torch.full((_AROUND,), weight)
+        weight = 4 / _UNIFORM  # the mean of a clamped cosine over the sphere is 1 / 4
+        return rig_directions(_UNIFORM), torch.full((_UNIFORM,), weight)
     middle = azel_to_direction(*light.azel_deg)
     if light.size_deg == 0:  # equal to a single light to the last bit
         return middle[None], torch.ones(1)
@@ -373,7 +374,7 @@ def is_narrow(directions: Tensor) -> bool:
     return bool((directions @ middle).min() > math.cos(math.radians(_WIDEST_DEG / 2**0.5)))
 
 
-def is_of_rig(directions: Tensor, lights: int = _AROUND) -> Tensor:
+def is_of_rig(directions: Tensor, lights: int = _UNIFORM) -> Tensor:
     """Return which directions [N, 3] belong to a rig; by default to the samples of uniform light."""
     return (directions[:, None] == rig_directions(lights)).all(-1).any(-1)
 

@@ -83,7 +83,7 @@ def single_lights(setups: Sequence[LightSetup]) -> Light:
 
     Equal lights of several setups are listed once. There is at least one far light, if necessary a dark one.
     """
-    far = replace(_far(len(setups), _far_lights(setups)), own_rgb=_own_weights(setups))
+    far = replace(_far(len(setups), _far_lights(setups)), original_rgb=_original_weights(setups))
     near = [
         (row, replace(light, rgb=(1.0, 1.0, 1.0), kelvin=None, stops=0.0), intensity_of(light))
         for row, setup in enumerate(setups)
@@ -114,17 +114,17 @@ def _far(count: int, lights: Iterable[FarLight]) -> Light:
     return Light(torch.cat(directions), torch.cat(weights, 1), keys=keys)
 
 
-def _own_weights(setups: Sequence[LightSetup]) -> Tensor | None:
+def _original_weights(setups: Sequence[LightSetup]) -> Tensor | None:
     """Return the weights [M, 3] of the photo's original light; None if no setup uses it."""
-    each = [[intensity_of(light) for light in setup.lights if light.own] for setup in setups]
-    return torch.stack([sum(own, torch.zeros(3)) for own in each]) if any(each) else None
+    each = [[intensity_of(light) for light in setup.lights if light.original] for setup in setups]
+    return torch.stack([sum(factors, torch.zeros(3)) for factors in each]) if any(each) else None
 
 
 def with_room(setup: LightSetup) -> LightSetup:
     """Return the setup with its ambient fill as one more light."""
     if not setup.room:
         return setup
-    lights = [light for light in setup.lights if light.envmap is None and not light.own]
+    lights = [light for light in setup.lights if light.envmap is None and not light.original]
     total = torch.stack([intensity_of(light) for light in lights]).sum(0)
     red, green, blue = (setup.room * float(value) for value in total)
     names = (*setup.names, ROOM) if setup.names else ()
@@ -150,7 +150,7 @@ def lights_over_stack(setups: tuple[LightSetup, ...], directions: Tensor, sampli
     for row, towards, rgb in _far_lights(setups):
         index, share = lights_around(towards, directions)
         weights[row].index_add_(0, index.flatten(), (share[..., None].float() * rgb[:, None]).flatten(0, 1))
-    return Light(directions, weights, _own_weights(setups))
+    return Light(directions, weights, _original_weights(setups))
 
 
 def off_rig_deg(setups: Sequence[LightSetup], directions: Tensor) -> float:
@@ -163,7 +163,7 @@ def off_rig_deg(setups: Sequence[LightSetup], directions: Tensor) -> float:
 def _far_lights(setups: Sequence[LightSetup]) -> Iterator[FarLight]:
     for row, setup in enumerate(setups):
         for light in setup.lights:
-            if light.azel_deg is not None or light.is_around:
+            if light.azel_deg is not None or light.is_uniform:
                 towards, shares = far_samples(light)
                 yield row, towards, shares[:, None] * intensity_of(light)
 

@@ -36,17 +36,17 @@ class LightSetup:
     @property
     def has_single(self) -> bool:
         """True if a light is neither a map nor the photo's original light."""
-        return any(light.envmap is None and not light.own for light in self.lights)
+        return any(light.envmap is None and not light.original for light in self.lights)
 
     @property
-    def has_own(self) -> bool:
+    def has_original(self) -> bool:
         """True if the photo's original light is one of the lights."""
-        return any(light.own for light in self.lights)
+        return any(light.original for light in self.lights)
 
     @property
     def by_photo(self) -> list[StudioLight]:
         """Lights whose brightness follows from the photo."""
-        return [light for light in self.lights if light.own or light.even]
+        return [light for light in self.lights if light.original or light.delight]
 
     def on_person(self, face: int, uniform: float = 1.0) -> Self:
         """Return the setup as it lights one person.
@@ -56,8 +56,8 @@ class LightSetup:
         """
 
         def lit(light: StudioLight) -> StudioLight:
-            factor = 0.0 if light.face not in (None, face) else uniform if light.even else 1.0
+            factor = 0.0 if light.face not in (None, face) else uniform if light.delight else 1.0
             red, green, blue = (factor * value for value in light.rgb)
-            return replace(light, rgb=(red, green, blue), even=False)
+            return replace(light, rgb=(red, green, blue), delight=False)
 
         return replace(self, lights=tuple(map(lit, self.lights)))

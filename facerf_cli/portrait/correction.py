@@ -1,4 +1,4 @@
-"""Corrections of a model by its photo, so that the photo's own light reproduces the photo.
+"""Corrections of a model by its photo, so that the photo's original light reproduces it.
 
 A network's errors (the white of an eye too bright, a crease too shallow) are similar under lights that shade
 the person alike. Under the photo's light they are known: the photo divided by its explanation is a ratio

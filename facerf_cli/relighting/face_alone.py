@@ -70,10 +70,10 @@ class FaceAlone(Relightable):
         side, near = self.head.face.texture.shape[-1], lights.near_points(self.vertices_m.mean(0))
         textures = self.reflectance.relit(lights.directions, lights.weights, turn)
         extra = [near_texture(self.reflectance, points, self.vertices_m, side, turn) for points, _ in near]
-        for number, (own, texture) in enumerate(zip(lights.owns, textures, strict=True)):
+        for number, (original_rgb, texture) in enumerate(zip(lights.original_rgbs, textures, strict=True)):
             for one, (_, rgb) in zip(extra, near, strict=True):
                 texture = texture + rgb[number][:, None, None] * one
-            yield Relit(texture, own=own)
+            yield Relit(texture, original_rgb=original_rgb)
 
     def renderer(self, request: RenderRequest) -> Callable[[slice], dict[str, np.ndarray]]:
         require_face_layers(request.layers)
@@ -94,9 +94,9 @@ class FaceAlone(Relightable):
         return layers
 
     def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
-        own = torch.zeros(3) if relit.own is None else relit.own.detach()
+        original_rgb = torch.zeros(3) if relit.original_rgb is None else relit.original_rgb.detach()
         source = self.head.face.texture
-        textures = relit.texture + own[:, None, None] * source, source
+        textures = relit.texture + original_rgb[:, None, None] * source, source
         lit, plate = (texture.permute(1, 2, 0).numpy() for texture in textures)
         visible = self.head.face.visible.numpy()
         return chosen_exposure_ev(rule, lit, plate, visible, visible)

@@ -136,7 +136,7 @@ class PersonInPhoto:
 
     def relit(self, lights: Light) -> Iterator[Relit]:
         """Yield the person under each sum of lights; the face field ignores light from behind."""
-        field, owns = self._field, lights.owns
+        field, original_rgbs = self._field, lights.original_rgbs
         lights, keys = lights.with_keys_alone()
         directions, weights = lights.directions, lights.weights
         middle_m, side = self.vertices_m.mean(0), self._head.face.texture.shape[-1]
@@ -162,7 +162,7 @@ class PersonInPhoto:
             for at in range(len(blended))
         ]
         shadows: dict[tuple[bool, int], CastShadow] = {}
-        for number, own in enumerate(owns):
+        for number, original_rgb in enumerate(original_rgbs):
             cast = []
             for key in (one for one in keys if one.number == number):
                 at = key.is_near, key.samples.start
@@ -170,7 +170,7 @@ class PersonInPhoto:
                     light = near[at[1]][0] if key.is_near else directions[key.samples].detach()
                     shadows[at] = cast_shadow(field.views[0], light)
                 cast.append((every[key.alone], shadows[at]))
-            yield replace(every[number], own=own, keys=tuple(cast))
+            yield replace(every[number], original_rgb=original_rgb, keys=tuple(cast))
 
     @cached_property
     def _eyes(self) -> Eyes:
@@ -301,10 +301,12 @@ class PersonInPhoto:
         return {name: values}
 
     def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
-        view, own = self._field.views[0], torch.zeros(3) if relit.own is None else relit.own.detach()
+        view = self._field.views[0]
+        original_rgb = torch.zeros(3) if relit.original_rgb is None else relit.original_rgb.detach()
         image, skin = view.person.image, view.person.classes[class_index("skin")].numpy()
         (radiance,) = view.render(relit.views[0])
-        lit, plate = (x.permute(1, 2, 0).numpy() for x in (radiance + own[:, None, None] * image, image))
+        lit = radiance + original_rgb[:, None, None] * image
+        lit, plate = (pixels.permute(1, 2, 0).numpy() for pixels in (lit, image))
         return chosen_exposure_ev(rule, lit, plate, skin, view.person.own_pixels.numpy())
 
     @cached_property
@@ -369,16 +371,16 @@ class PeopleInPhoto(Relightable):
         ]
         return partial(self._render, request, ready)
 
-    def own_layer(self) -> np.ndarray:
+    def original_layer(self) -> np.ndarray:
         """Return the people [H, W, 3] as photographed, over black."""
-        return in_strips(self._own_rows, *self.size_px)["own"]
+        return in_strips(self._original_rows, *self.size_px)["original"]
 
     def _alpha_rows(self, rows: slice) -> dict[str, np.ndarray]:
         return {"alpha": _alpha(self._present(rows)[1])[..., 0]}
 
-    def _own_rows(self, rows: slice) -> dict[str, np.ndarray]:
+    def _original_rows(self, rows: slice) -> dict[str, np.ndarray]:
         numbers, alphas = self._present(rows)
-        return {"own": _over(alphas, [self.people[number].own[rows] for number in numbers])}
+        return {"original": _over(alphas, [self.people[number].own[rows] for number in numbers])}
 
     def _render(
         self, request: RenderRequest, ready: Sequence[Sequence[Any]], rows: slice
@@ -392,11 +394,11 @@ class PeopleInPhoto(Relightable):
         under_each, layers = zip(*images, strict=True), dict[str, np.ndarray]()
         if request.image is not None:
             each = next(under_each)
-            pixels = _with_own_light(each, [request.image[number] for number in numbers], owns)
+            pixels = _with_original_light(each, [request.image[number] for number in numbers], owns)
             layers["rgb"] = self._image(request, alphas, owns, pixels, rows)
             layers |= _layers(alphas, each)
         for (name, relit), each in zip(request.lights.items(), under_each, strict=True):
-            pixels = _with_own_light(each, [relit[number] for number in numbers], owns)
+            pixels = _with_original_light(each, [relit[number] for number in numbers], owns)
             layers[name] = _over(alphas, pixels)
         if request.wrap is not None and request.image is not None:
             layers["wrap"] = request.wrap[rows]
@@ -432,14 +434,14 @@ class PeopleInPhoto(Relightable):
         return _over(alphas, pixels) / np.maximum(_alpha(alphas), _TINY)  # not premultiplied
 
 
-def _with_own_light(
+def _with_original_light(
     images: Sequence[dict[str, np.ndarray]], relit: Sequence[Relit], owns: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
     """Add the photo's original light to pixels [h, W, 3] of people; `owns` are their colours under it."""
     return [
         image["rgb"]
-        if one.own is None or not one.own.any()
-        else image["rgb"] + one.own.detach().numpy() * own
+        if one.original_rgb is None or not one.original_rgb.any()
+        else image["rgb"] + one.original_rgb.detach().numpy() * own
         for image, one, own in zip(images, relit, owns, strict=True)
     ]
 

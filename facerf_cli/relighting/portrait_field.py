@@ -113,7 +113,7 @@ class PortraitView:
     maps: PortraitMaps  # batch of 1; the albedo is in the units of the network's input
     exposure: Tensor  # radiance of the photo over the maps' radiance in the photo's light, [3, 1, 1]
     correction: Correction | None = None  # ratio image
-    own: PersonShading | None = None  # shading in the photo's light, if the user supplied normals
+    original: PersonShading | None = None  # shading in the photo's light, if the user supplied normals
 
     @staticmethod
     def of(person: SeenPerson, maps: PortraitMaps, source: SourceLight | None) -> "PortraitView":
@@ -123,7 +123,7 @@ class PortraitView:
         view = view._fit_to_photo(source)
         if person.normals is None:
             return view
-        return replace(view, own=view.shade(source.light.directions, source.light.weights[None])[0])
+        return replace(view, original=view.shade(source.light.directions, source.light.weights[None])[0])
 
     def _without_baked_in(self, key: Tensor, key_fraction: float) -> "PortraitView":
         """Remove the photo's shading and highlights from the albedo, given the key light's shading [S, S]."""

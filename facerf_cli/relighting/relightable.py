@@ -29,7 +29,7 @@ class Relit:
     views: tuple[PersonShading, ...] = ()  # the person in each square
     eye_reflections: Tensor | None = None  # what the irises reflect [N, 3, s, s]
     mouth: Tensor | None = None  # the face [3, T, T] under the light that enters the mouth
-    own: Tensor | None = None  # weight [3] of the photo's original light in the sum
+    original_rgb: Tensor | None = None  # weight [3] of the photo's original light in the sum
     keys: "tuple[tuple[Relit, CastShadow], ...]" = ()  # each key light on its own, and the shadow it casts
 
     @property

@@ -216,7 +216,7 @@ class UpsampledView:
         coloured = self._continued(torch.cat([view.maps.albedo[0], view.person.exposed]))
         self._fixed_maps = torch.cat([coloured, classes[BARE].sum(0, keepdim=True)])
         self._normals = None if view.person.normals is None else self._continued(view.maps.normals[0])
-        self._own_light = None if view.own is None else self.precompute(view.own)
+        self._original = None if view.original is None else self.precompute(view.original)
 
     def weight(self, among: Window) -> tuple[Window, np.ndarray]:
         """Return the columns of a window that the square covers, and the view's weight [h, w] there."""
@@ -270,7 +270,7 @@ class UpsampledView:
         if self._normals is not None and self._view.person.normals is not None:
             supplied = torch.from_numpy(self._view.person.normals[window]).permute(2, 0, 1)
             finer = (supplied - _read(self._normals, grid)) * supplied.any(0)  # 0 where none are supplied
-        own = None if finer is None or self._own_light is None else _change(self._own_light, grid, finer)
+        original = None if finer is None or self._original is None else _change(self._original, grid, finer)
         if rims is not None:
             offsets_px, brightness = rims.at(window)
             inward = grid + offsets_px.permute(1, 2, 0) * (2 / self._view.person.square.side_px)
@@ -281,8 +281,8 @@ class UpsampledView:
             if "rear" in maps:
                 shading, specular = _read(maps["rear"], inward).chunk(2)
                 values["rear"] = (albedo * shading + detail * specular) * brightness
-            if own is not None and finer is not None:
-                values["change"] = _change(maps, grid, finer) / own
+            if original is not None and finer is not None:
+                values["change"] = _change(maps, grid, finer) / original
             if "albedo" in maps:
                 values["albedo"] = albedo * self._view.exposure
             for name in maps.keys() & {"normal", "shadow", "specular"}:

@@ -28,7 +28,7 @@ void main() {
 const COMPOSE = `${HEADER}
 uniform sampler2D guide, plate, matte, photo, sum;
 uniform float white, keep; // linear value of the guide's white; 1 over the background, 0 over nothing
-uniform vec3 own; // exposed strength of the photo's own light
+uniform vec3 original; // exposed strength of the photo's original light
 out vec4 colour;
 vec3 decoded(vec3 x) { return mix(x / 12.92, pow((x + 0.055) / 1.055, vec3(2.4)), step(0.04045, x)); }
 vec3 encoded(vec3 x) {
@@ -48,10 +48,10 @@ void main() {
   float under = keep > 0.0 ? 1.0 : max(share, 0.001); // colours over nothing are not multiplied by the matte
   vec3 added = white * decoded(texelFetch(guide, at, 0).rgb) * texture(sum, (vec2(at) + 0.5) / size).rgb / under;
   vec3 background = decoded(texelFetch(plate, at, 0).rgb);
-  vec3 person = share > 0.0 ? own * (decoded(texelFetch(photo, at, 0).rgb) - background) / under : vec3(0);
+  vec3 person = share > 0.0 ? original * (decoded(texelFetch(photo, at, 0).rgb) - background) / under : vec3(0);
   vec3 held = keep * background + person;
   vec3 mixed = held + added, soft = softened(mixed);
-  vec3 shown = own == vec3(0) ? mix(mixed, soft, keep > 0.0 ? share : 1.0) : soft + held - softened(held);
+  vec3 shown = original == vec3(0) ? mix(mixed, soft, keep > 0.0 ? share : 1.0) : soft + held - softened(held);
   float alpha = max(share, keep);
   colour = vec4(encoded(shown) * alpha, alpha);
 }`;
@@ -94,8 +94,8 @@ class GpuView {
     gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, light, ...data.small, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
   }
 
-  // Draw the sum by weights [lights * 3] and the photo's own light [3], over its background or over nothing.
-  draw(weights, own, withBackground) {
+  // Draw the sum by weights [lights * 3] and the photo's original light [3], over its background or over nothing.
+  draw(weights, original, withBackground) {
     const { gl, data } = this;
     const texels = Float32Array.from({ length: 4 * data.scales.length }, (_, i) => weights[3 * (i >> 2) + Math.min(2, i % 4)]);
     gl.activeTexture(gl.TEXTURE0 + TEXTURES.indexOf("weights"));
@@ -106,7 +106,7 @@ class GpuView {
       gl.viewport(0, 0, ...size);
       if (!buffer) {
         gl.uniform1f(gl.getUniformLocation(program, "keep"), withBackground ? 1 : 0);
-        gl.uniform3f(gl.getUniformLocation(program, "own"), ...own);
+        gl.uniform3f(gl.getUniformLocation(program, "original"), ...original);
       }
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     }
@@ -169,19 +169,19 @@ class CanvasView {
     this.ratios[light] = pixels;
   }
 
-  draw(weights, own, withBackground) {
+  draw(weights, original, withBackground) {
     const [shown, sum] = [this.context.createImageData(...this.data.small), weighed(this.ratios, weights)];
     for (let at = 0; at < sum.length; at += 4) {
       const share = this.matte[at] / 255;
       const under = withBackground ? 1 : Math.max(share, 0.001);
-      const held = own.map((value, c) => {
+      const held = original.map((value, c) => {
         const background = decoded(this.plate[at + c] / 255);
         const person = share && (value * (decoded(this.photo[at + c] / 255) - background)) / under;
         return withBackground ? background + person : person;
       });
       const mixed = held.map((value, c) => value + (this.data.white * decoded(this.guide[at + c] / 255) * sum[at + c]) / under);
       const [soft, bent, part] = [softened(mixed), softened(held), withBackground ? share : 1];
-      const pixel = soft.map((value, c) => own.some(Boolean) ? value + held[c] - bent[c] : mixed[c] + part * (value - mixed[c]));
+      const pixel = soft.map((value, c) => original.some(Boolean) ? value + held[c] - bent[c] : mixed[c] + part * (value - mixed[c]));
       shown.data.set([...pixel.map((value) => 255 * encoded(value)), withBackground ? 255 : 255 * share], at);
     }
     this.context.putImageData(shown, 0, 0);

@@ -4,7 +4,7 @@ const MOST_LIGHTS = 9;
 const WHITE_K = 6504; // of D65
 const [APART_DEG, MOST_A_SIDE] = [6, 6]; // samples of a soft light (light/light.py)
 const XYZ_TO_RGB = [[3.2404542, -1.5371385, -0.4985314], [-0.969266, 1.8760108, 0.041556], [0.0556434, -0.2040259, 1.0572252]];
-const [ROOM, OWN] = ["room", "own"]; // names of a light that stands for the room, and of the photo's own light
+const [ROOM, ORIGINAL] = ["room", "original"]; // names of a light that stands for the room, and of the photo's original light
 // Numbers of the keys of a light, and their limits; those of a page, and others of --light, which it cannot show.
 const KEYS = {
   at: [3, -1e4, 1e4], from: [2, -1e5, 1e5], rgb: [3, 0, 1e6], kelvin: [1, 1667, 25000], stops: [1, -20, 20],
@@ -12,7 +12,7 @@ const KEYS = {
 };
 const OTHER_KEYS = ["map", "rotate", "spot", "face"];
 
-const newLight = (values) => ({ name: "", azimuth: 0, elevation: 0, around: false, own: false, rgb: [1, 1, 1], kelvin: WHITE_K, stops: 0, size: 0, ...values });
+const newLight = (values) => ({ name: "", azimuth: 0, elevation: 0, uniform: false, original: false, rgb: [1, 1, 1], kelvin: WHITE_K, stops: 0, size: 0, ...values });
 const isName = (text) => /^[A-Za-z][\w-]*$/.test(text) && !Object.hasOwn(KEYS, text) && ![...OTHER_KEYS, "name"].includes(text);
 const numbersIn = (text) => text.split(",").map((part) => (part.trim() ? Number(part) : NaN));
 const rounded = (value, digits) => Number(value.toFixed(digits));
@@ -103,7 +103,7 @@ function lightsOf(text, known) {
     if (!lights) throw wrong(`${where} is no direction; give AZ,EL, ${Object.keys(known.words).join(", ")}, or a preset: ${Object.keys(known.presets).join(", ")}`);
     return lights.map((light) => newLight({
       ...light,
-      name: [name, light.name].filter(Boolean).join("_") || (light.own ? OWN : ""),
+      name: [name, light.name].filter(Boolean).join("_") || (light.original ? ORIGINAL : ""),
       rgb: (light.rgb ?? [1, 1, 1]).map((value, c) => value * tint[c]),
       stops: (light.stops ?? 0) + stops,
       kelvin: numbers("kelvin", [light.kelvin ?? WHITE_K])[0],
@@ -129,8 +129,8 @@ function placed(at, side) {
 }
 
 // A light of a word or a preset, from the fields that it has in facerf.
-function ofPacked({ name, azel_deg, at_m, size_m, size_deg, rgb, kelvin, stops, own }) {
-  const far = azel_deg ? { ...towards(...azel_deg), size: size_deg } : { own, around: !own };
+function ofPacked({ name, azel_deg, at_m, size_m, size_deg, rgb, kelvin, stops, original }) {
+  const far = azel_deg ? { ...towards(...azel_deg), size: size_deg } : { original, uniform: !original };
   const place = at_m ? placed(at_m, size_m) : far;
   return { name, rgb, kelvin: kelvin ?? WHITE_K, stops, ...place };
 }
@@ -142,7 +142,7 @@ function textsOf(lights, named) {
   if (named || lights.some(({ name }) => name) || (lights.length > 1 && !areShort)) {
     return namesOf(lights).map((name, i) => {
       const { short, keys } = parts[i];
-      if (lights[i].own && name === OWN) return keys.replace("from=", "");
+      if (lights[i].original && name === ORIGINAL) return keys.replace("from=", "");
       return short ? `${name}=${short}` : `name=${name};${keys}`;
     });
   }
@@ -150,12 +150,12 @@ function textsOf(lights, named) {
 }
 
 // A light by its keys, and by its direction alone where that tells all.
-function partsOf({ azimuth, elevation, around, own, rgb, kelvin, stops, size }) {
-  const where = own ? OWN : around ? "around" : `${rounded(azimuth, 2)},${rounded(elevation, 2)}`;
+function partsOf({ azimuth, elevation, uniform, original, rgb, kelvin, stops, size }) {
+  const where = original ? ORIGINAL : uniform ? "uniform" : `${rounded(azimuth, 2)},${rounded(elevation, 2)}`;
   const colour = rgb.every((value) => value === 1) ? "" : rgb.map((value) => Number(value.toPrecision(4))).join(",");
-  const keys = { kelvin: kelvin !== WHITE_K && kelvin, stops: rounded(stops, 2), size_deg: !around && !own && rounded(size, 2) };
+  const keys = { kelvin: kelvin !== WHITE_K && kelvin, stops: rounded(stops, 2), size_deg: !uniform && !original && rounded(size, 2) };
   const others = Object.keys(keys).filter((key) => keys[key]).map((key) => `${key}=${keys[key]}`);
-  const short = others.length || colour || around || own ? "" : where;
+  const short = others.length || colour || uniform || original ? "" : where;
   return { short, keys: [`from=${where}`, colour && `rgb=${colour}`, ...others].filter(Boolean).join(";") };
 }
 

@@ -11,7 +11,7 @@ const CONTROLS = {
     kelvin: ["Colour", "K", 1700, 12000, 50, 1667, 25000],
     size: ["Softness", "°", 0, 120, 1],
   },
-  own: { ownStops: ["Own light", "stops", -6, 6, 0.1, -20, 20] },
+  original: { originalStops: ["Original light", "stops", -6, 6, 0.1, -20, 20] },
   room: { room: ["Room", "%", 0, 30, 1, 0, 100] },
   map: { rotate: ["Rotate", "°", -180, 180, 1], mapStops: ["Intensity", "stops", -6, 6, 0.1] },
   image: { exposure: ["Exposure", "EV", -6, 8, 0.05, -20, 20] },
@@ -29,14 +29,14 @@ function stateOf(address, maps, data) {
   };
   const named = (name) => maps.find((map) => map.name === given.get(name));
   const map = named("env") ?? named("room") ?? null; // a map may be the room
-  const found = { lights: map ? [] : [newLight({ azimuth: 40, elevation: 25 })], own: [], message: "" };
+  const found = { lights: map ? [] : [newLight({ azimuth: 40, elevation: 25 })], original: [], message: "" };
   try {
     if (given.has("light")) {
       const lights = given.getAll("light").flatMap((text) => lightsOf(text, data));
-      found.own = lights.filter(({ own }) => own);
-      found.lights = lights.filter(({ own }) => !own);
+      found.original = lights.filter(({ original }) => original);
+      found.lights = lights.filter(({ original }) => !original);
     }
-    if (found.own.length > 1) found.message = "The photo's own light is given twice; the first is shown";
+    if (found.original.length > 1) found.message = "The original light occurs twice; the first is shown";
     else if (found.lights.length > MOST_LIGHTS) found.message = `The first ${MOST_LIGHTS} of ${found.lights.length} lights are shown`;
     else if (found.lights.some(({ near }) => near)) found.message = NEAR;
   } catch (error) {
@@ -45,7 +45,7 @@ function stateOf(address, maps, data) {
   if (!map && given.has("env")) found.message = `env=${given.get("env")}: give ${maps.map(({ name }) => name).join(", ")}`;
   return {
     lights: found.lights.slice(0, MOST_LIGHTS),
-    own: found.own[0] ?? null, // the photo's own light
+    original: found.original[0] ?? null, // the photo's original light
     message: found.message,
     selected: 0,
     room: named("room") || given.get("room") === "none" ? 0 : number("room", 0, 1), // null: by the background
@@ -60,8 +60,8 @@ function stateOf(address, maps, data) {
 
 const NEAR = "A near light is shown as a far one from its side; the command names what is shown";
 
-// All lights, the photo's own one among them.
-const allOf = ({ lights, own }) => (own ? [...lights, own] : lights);
+// All lights, including the original light.
+const allOf = ({ lights, original }) => (original ? [...lights, original] : lights);
 
 function addressOf(state) {
   const { room, map, rotate, mapStops, exposure, background, compare } = state;
@@ -79,32 +79,32 @@ function addressOf(state) {
 }
 
 // The share that comes from all around, as `facerf relight` has it: of the lights; of a map alone where it is asked for.
-function roomOf({ room, background, lights, map, own }, data) {
+function roomOf({ room, background, lights, map, original }, data) {
   if (!data.room || hasRoom(lights) || !(lights.length || map)) return 0;
-  return room ?? (own || !lights.length ? 0 : background && data.background ? data.room.bright : data.room.dark);
+  return room ?? (original || !lights.length ? 0 : background && data.background ? data.room.bright : data.room.dark);
 }
 
 // True where a light stands for the room.
-const hasRoom = (lights) => lights.some(({ around, name }) => around || name === ROOM);
+const hasRoom = (lights) => lights.some(({ uniform, name }) => uniform || name === ROOM);
 
 // The command lines that make the same image; a map shines together with lights where all have names.
 function commandOf(state, data, ev, ofRoom) {
-  const { map, lights, own, room, rotate, mapStops, background } = state;
-  if (!map && !lights.length && !own) return "# add a light, or choose an environment";
+  const { map, lights, original, room, rotate, mapStops, background } = state;
+  if (!map && !lights.length && !original) return "# add a light, or choose an environment";
   const quoted = (text) => (/^[\w@%+=:,./-]+$/.test(text) ? text : "'" + text.replaceAll("'", `'"'"'`) + "'");
   const roomOfMap = !lights.length && ofRoom.some(Boolean);
-  const both = Boolean(map && (lights.length || own || roomOfMap));
+  const both = Boolean(map && (lights.length || original || roomOfMap));
   const keys = [`map=${map?.path}`, rotate && `rotate=${rotate}`, mapStops && `stops=${mapStops}`];
   const asLight = both && mapStops; // which --envmap has none of
   const texts = asLight ? [["name=envmap", ...keys.filter(Boolean)].join(";")] : [];
   texts.push(...textsOf(allOf(state), both));
-  if (roomOfMap) texts.push(`name=${ROOM};${partsOf(newLight({ around: true, rgb: ofRoom })).keys}`);
+  if (roomOfMap) texts.push(`name=${ROOM};${partsOf(newLight({ uniform: true, rgb: ofRoom })).keys}`);
   let line = `facerf relight ${data.source}`;
   if (map && !asLight) line += ` --envmap ${quoted((both ? "envmap=" : "") + map.path)}` + (rotate ? ` --rotate ${rotate}` : "");
   line += texts.map((text) => ` --light ${quoted(text)}`).join("");
-  if (lights.length && data.room && room !== null && !hasRoom(lights) && (room || !own)) line += ` --room ${rounded(room, 4) || "none"}`;
+  if (lights.length && data.room && room !== null && !hasRoom(lights) && (room || !original)) line += ` --room ${rounded(room, 4) || "none"}`;
   const exposure = rounded(ev + (map && !both ? mapStops : 0), 2); // stops of a map alone are exposure
-  if (exposure || !own) line += ` --exposure ${exposure}`;
+  if (exposure || !original) line += ` --exposure ${exposure}`;
   if (data.background && !background) line += " --background none";
   return (map?.command ? map.command + "\n" : "") + line + " -o out";
 }
@@ -142,12 +142,12 @@ class Page {
     byId("before").src = images.photo.src;
     byId("frame").style.setProperty("--sides", data.size[0] / data.size[1]);
     byId("background").hidden = !data.background;
-    byId("aroundRow").hidden = byId("roomRows").hidden = !data.room;
+    byId("uniformRow").hidden = byId("roomRows").hidden = !data.room;
     for (const [section, controls] of Object.entries(CONTROLS)) {
       byId(`${section}Rows`).append(...Object.entries(controls).map(([id, control]) => this.row(id, control)));
     }
-    byId("ownRows").hidden = !data.words.own;
-    byId("ownRows").querySelector("label").htmlFor = "own";
+    byId("originalRows").hidden = !data.words.original;
+    byId("originalRows").querySelector("label").htmlFor = "original";
     byId("presets").append(...Object.keys(data.presets).map((name) => new Option(name)));
     this.fillMaps();
     this.connect();
@@ -184,9 +184,9 @@ class Page {
 
   // Set a value of the light or the image; null is what it begins with.
   set(id, value) {
-    const { own } = this.state;
+    const { original } = this.state;
     if (id in CONTROLS.light) this.changeLight({ [id]: value ?? newLight()[id] });
-    else if (id in CONTROLS.own) this.change({ own: own && { ...own, stops: value ?? 0 } });
+    else if (id in CONTROLS.original) this.change({ original: original && { ...original, stops: value ?? 0 } });
     else this.change({ [id]: value ?? (id in CONTROLS.map ? 0 : null) });
   }
 
@@ -228,7 +228,7 @@ class Page {
     for (const light of lights) {
       const rgb = rgbOf(light);
       rgb.forEach((value, c) => (sent[c] += value));
-      if (light.around) rgb.forEach((value, c) => (weights[last + c] += 4 * value));
+      if (light.uniform) rgb.forEach((value, c) => (weights[last + c] += 4 * value));
       else {
         for (const [i, share] of this.rig.sharesOf(samplesOf(light))) rgb.forEach((value, c) => (weights[3 * i + c] += share * value));
       }
@@ -242,10 +242,10 @@ class Page {
     this.waiting = null;
     const { state, data } = this;
     const weights = this.weights();
-    this.ev = state.exposure ?? (state.own ? 0 : automaticEv(data.exposure, weights));
+    this.ev = state.exposure ?? (state.original ? 0 : automaticEv(data.exposure, weights));
     const exposed = weights.map((value) => value * 2 ** this.ev);
-    const own = state.own ? rgbOf(state.own).map((value) => value * 2 ** this.ev) : [0, 0, 0];
-    this.view.draw(scaled(exposed, data.scales), own, state.background && data.background);
+    const original = state.original ? rgbOf(state.original).map((value) => value * 2 ** this.ev) : [0, 0, 0];
+    this.view.draw(scaled(exposed, data.scales), original, state.background && data.background);
     drawBall(byId("ballView"), this.rig.lights, exposed);
     this.update();
     document.body.dataset.settled = "true";
@@ -256,20 +256,20 @@ class Page {
   // Show the state in the controls.
   update() {
     const { state, light, data } = this;
-    const around = light?.around;
-    this.show(CONTROLS.light, light ?? newLight(), (id) => !light || (around && ["azimuth", "elevation", "size"].includes(id)));
-    this.show(CONTROLS.own, { ownStops: state.own?.stops ?? 0 }, () => !state.own);
-    byId("own").checked = Boolean(state.own);
+    const uniform = light?.uniform;
+    this.show(CONTROLS.light, light ?? newLight(), (id) => !light || (uniform && ["azimuth", "elevation", "size"].includes(id)));
+    this.show(CONTROLS.original, { originalStops: state.original?.stops ?? 0 }, () => !state.original);
+    byId("original").checked = Boolean(state.original);
     this.show(CONTROLS.room, { room: roomOf(state, data) }, () => hasRoom(state.lights) || !(light || state.map));
     this.show(CONTROLS.map, state, () => !state.map);
     this.show(CONTROLS.image, { exposure: this.ev }, () => false);
     byId("envmap").value = this.maps.indexOf(state.map);
     byId("add").disabled = state.lights.length >= MOST_LIGHTS;
-    for (const id of ["remove", "name", "tint", "around"]) byId(id).disabled = !light;
+    for (const id of ["remove", "name", "tint", "uniform"]) byId(id).disabled = !light;
     if (document.activeElement !== byId("name")) byId("name").value = light?.name ?? "";
     byId("name").placeholder = light ? `light${state.selected + 1}` : "";
     byId("tint").value = hexOf(light?.rgb ?? [1, 1, 1]);
-    byId("around").checked = Boolean(around);
+    byId("uniform").checked = Boolean(uniform);
     const pressed = { auto: state.exposure === null, background: state.background, compare: state.compare !== null };
     for (const [id, is] of Object.entries(pressed)) byId(id).ariaPressed = String(is);
     this.showLights();
@@ -299,7 +299,7 @@ class Page {
       const box = place.getBoundingClientRect();
       fill(place, lights.length, (i) => this.newMark(i)).forEach((mark, i) => {
         const light = lights[i];
-        const where = light.around ? "from all around" : `azimuth ${Math.round(light.azimuth)}, elevation ${Math.round(light.elevation)} degrees`;
+        const where = light.uniform ? "uniform" : `azimuth ${Math.round(light.azimuth)}, elevation ${Math.round(light.elevation)} degrees`;
         mark.textContent = isList ? light.name || i + 1 : i + 1;
         mark.ariaLabel = `Light ${i + 1}${light.name && `, ${light.name}`}: ${where}`;
         mark.title = mark.ariaLabel;
@@ -308,7 +308,7 @@ class Page {
         if (isList) return;
         const [x, y] = flatOf(light);
         const { left, top, radius } = this.middleOf(place, box);
-        mark.hidden = light.around;
+        mark.hidden = light.uniform;
         mark.classList.toggle("behind", Math.hypot(x, y) > 1);
         mark.style.left = `${limited(left + radius * x, MARK_MARGIN, box.width - MARK_MARGIN)}px`;
         mark.style.top = `${limited(top - radius * y, MARK_MARGIN, box.height - MARK_MARGIN)}px`;
@@ -345,8 +345,8 @@ class Page {
     on("name", (text) => this.rename(text.trim()));
     byId("name").addEventListener("blur", () => (byId("name").setCustomValidity(""), this.change({})));
     on("tint", (hex) => this.changeLight({ rgb: [1, 3, 5].map((i) => decoded(parseInt(hex.slice(i, i + 2), 16) / 255)) }));
-    on("own", () => this.change({ own: byId("own").checked ? newLight({ name: OWN, own: true }) : null }));
-    on("around", () => this.changeLight({ around: byId("around").checked }));
+    on("original", () => this.change({ original: byId("original").checked ? newLight({ name: ORIGINAL, original: true }) : null }));
+    on("uniform", () => this.changeLight({ uniform: byId("uniform").checked }));
     const actions = {
       add: () => this.add(),
       remove: () => this.remove(),
@@ -378,7 +378,7 @@ class Page {
       const box = pad.getBoundingClientRect();
       const { left, top, radius } = this.middleOf(pad, box);
       const [x, y] = [event.clientX + from.x - box.left - left, box.top + top - event.clientY - from.y];
-      this.changeLight({ ...azelAt(x / radius, y / radius), around: false });
+      this.changeLight({ ...azelAt(x / radius, y / radius), uniform: false });
     };
     pad.addEventListener("pointerdown", (event) => {
       if (event.button || from) return;
@@ -435,7 +435,7 @@ class Page {
     byId("presets").value = "";
     const lights = lightsOf(name, this.data);
     this.say(lights.some(({ near }) => near) ? NEAR : "");
-    this.change({ lights, own: null, selected: 0 });
+    this.change({ lights, original: null, selected: 0 });
   }
 
   rename(name) {

@@ -21,7 +21,8 @@ from facerf_cli.image.colour import (
     linear_to_srgb,
 )
 from facerf_cli.light.entries import (
-    EVEN,
+    DELIGHT,
+    ORIGINAL,
     ROOM_BEFORE_BRIGHT,
     ROOM_BEFORE_DARK,
     WORDS,
@@ -50,13 +51,13 @@ class PageMap:
 class Plate:
     """Further images [H, W, ...] of a page: the photo (`before`), the matte, the photo without its person.
 
-    `even` is the intensity of uniform light that makes skin as bright as in the photo.
+    `uniform_intensity` is the intensity of uniform light that makes skin as bright as in the photo.
     """
 
     before: np.ndarray
     matte: np.ndarray
     background: np.ndarray | None = None
-    even: float = 1.0
+    uniform_intensity: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ def packed(basis: Basis, plate: Plate, head: Sequence[float], maps: Sequence[Pag
         "room": room if len(basis.ratios) > len(basis.directions) else None,
         "matte": _webp(np.round(plate.matte * 255).astype(np.uint8)),
         "exposure": _exposure(basis.samples),
-        **packed_lights(plate.background is not None, plate.even),
+        **packed_lights(plate.background is not None, plate.uniform_intensity),
         "envmaps": [
             {
                 "name": envmap.name,
@@ -117,14 +118,14 @@ def _triangles(directions: np.ndarray) -> dict[str, str]:
     return {"triangles": _bytes(corners.astype("<u2").tobytes()), "shares": _floats(to_shares)}
 
 
-def packed_lights(of_photo: bool, even: float = 1.0) -> dict[str, Any]:
+def packed_lights(of_photo: bool, uniform_intensity: float = 1.0) -> dict[str, Any]:
     """Return the light of each word, and the named lights of each shipped rig.
 
-    The photo's original light, and uniform light of intensity `even`, are included only `of_photo`.
+    `original` and `delight` are included only `of_photo`; `delight` is uniform light of `uniform_intensity`.
     """
-    words = {word: light for word, light in WORDS.items() if of_photo or not (light.own or light.even)}
+    words = {word: light for word, light in WORDS.items() if of_photo or word not in (ORIGINAL, DELIGHT)}
     if of_photo:
-        words[EVEN] = replace(words[EVEN], rgb=(even, even, even))
+        words[DELIGHT] = replace(words[DELIGHT], rgb=(uniform_intensity,) * 3)
     images = {preset: lit_images([preset])[0] for preset in preset_names()}
     return {
         "words": {word: asdict(light) for word, light in words.items()},

@@ -48,9 +48,9 @@ class LightSources:
         envmap: Environment map: .exr, .hdr, .json of estimate-light, a folder or a quoted pattern; or
             procedural:N, the first N maps of facerf envmap. NAME=MAP joins the map with the named lights.
             Repeatable.
-        light: Light: AZ,EL in degrees (AZ > 0: image right), left, own (the photo's light), even (uniform), a
-            preset (rembrandt), a rig file, or keys (at=, size=); NAME=LIGHT;stops=-1. See docs/lights.md.
-            Repeatable.
+        light: Light: AZ,EL in degrees (AZ > 0: image right), left, original (the photo's light), delight
+            (uniform), a preset (rembrandt), a rig file, or keys (at=, size=); NAME=LIGHT;stops=-1. See
+            docs/lights.md. Repeatable.
         light_from: Photo to estimate the light from, as estimate-light does; or background, for the image
             behind the person. NAME=PHOTO joins its light with the named lights. Repeatable.
         fov_deg: Horizontal angle of view of an image without a face.
@@ -200,7 +200,7 @@ def in_room(setup: LightSetup, room: str | None, over_dark: bool) -> LightSetup:
     if not setup.has_single:
         return setup
     if room is None:
-        has_fill = ROOM in setup.names or any(light.is_around or light.own for light in setup.lights)
+        has_fill = ROOM in setup.names or any(light.is_uniform or light.original for light in setup.lights)
         default = ROOM_BEFORE_DARK if over_dark else ROOM_BEFORE_BRIGHT
         return replace(setup, room=0.0 if has_fill else default)
     if room == "none":

@@ -264,8 +264,8 @@ def _scene_of_stack(item: Item, plan: RelightPlan) -> Scene:
         "--network-alone": options.network_alone,
         "--normals-from": options.normals_from is not None,
         "--person": plan.photo.person is not None,
-        "--light own": any(light.own for light in lights),
-        "--light even": any(light.even for light in lights),
+        "--light original": any(light.original for light in lights),
+        "--light delight": any(light.delight for light in lights),
         "--light at=": any(light.at_m is not None for light in lights),
     }
     for option in (option for option, is_used in needs_photo.items() if is_used):
@@ -448,8 +448,9 @@ def _rendered(
     layers = arrays if matte is None else {"person.A": matte, **arrays}
     keeps = alpha is None and plan.options.background.kind != "envmap"
     added = None
-    if setup.has_own:
-        others = [layers[name] for name, light in zip(lit.names, lit.lights, strict=True) if not light.own]
+    if setup.has_original:
+        lights_by_name = zip(lit.names, lit.lights, strict=True)
+        others = [layers[name] for name, light in lights_by_name if not light.original]
         others += [layers["wrap"]] if wrap is not None else []
         added = SumOf(others, subject.size_px[1], alpha)
     return OutputImage(

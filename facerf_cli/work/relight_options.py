@@ -22,7 +22,7 @@ from facerf_cli.batch.recipe import DigestOf, Recipe, recipe_of
 from facerf_cli.batch.settings import NOT_IN_RECIPE
 from facerf_cli.errors import UsageError
 from facerf_cli.files.texts import file_sha256
-from facerf_cli.light.entries import EVEN, OWN, Sampling, is_sweep, numbers, parse_lights
+from facerf_cli.light.entries import DELIGHT, ORIGINAL, Sampling, is_sweep, numbers, parse_lights
 from facerf_cli.light.setups import LightSetup
 from facerf_cli.option import BATCH, IMAGE, LIGHT, METHOD, option
 from facerf_cli.work.light_setups import (
@@ -162,7 +162,7 @@ class RelightOptions(FieldOptions, PortraitOptions):
     exposure: Exposure | None = option(
         None,
         metavar="auto|face|EV",
-        shown_default="auto; 0 with own",
+        shown_default="auto; 0 with original",
         parse=parse_exposure,
         panel=IMAGE,
         everyday=True,
@@ -363,7 +363,7 @@ def _rules(options: RelightOptions, setups: Sequence[LightSetup]) -> dict[str, b
     of_field = "requires --reflectance portrait or field"
     of_whole = "requires the whole photo; remove --pose and --composite face"
     by_photo = [light for setup in setups for light in setup.by_photo]
-    word = OWN if by_photo and by_photo[0].own else EVEN
+    word = ORIGINAL if by_photo and by_photo[0].original else DELIGHT
     layers = {*_OF_EVERY_IMAGE, *options.aov, *(["wrap"] if options.light_wrap else [])}
     taken = [name for setup in setups for name in setup.names if name in layers]
     keeps_background = options.background.kind in ("photo", "none")
@@ -375,7 +375,7 @@ def _rules(options: RelightOptions, setups: Sequence[LightSetup]) -> dict[str, b
         f"--white: {of_field}": options.white != "photo" and baseline,
         f"--light {word}: {of_field}": bool(by_photo) and baseline,
         f"--background: {of_whole}": options.background.kind != "photo" and not whole,
-        f"--light {OWN}: {of_whole}": any(setup.has_own for setup in setups) and not whole,
+        f"--light {ORIGINAL}: {of_whole}": any(setup.has_original for setup in setups) and not whole,
         "--normals-from: requires --reflectance portrait and the whole photo": (
             options.normals_from is not None and (options.reflectance != "portrait" or not whole)
         ),

@@ -87,7 +87,7 @@ def of_photo(
     person = fit(models, photo, matte=matte, white=white, head=head, normals=normals)
     people = PeopleInPhoto([person.in_photo()])
     basis = basis_of_photo(person, people)
-    return basis, Plate(photo, people.matte, photo - people.own_layer(), person.uniform_intensity)
+    return basis, Plate(photo, people.matte, photo - people.original_layer(), person.uniform_intensity)
 
 
 def _write_page_of_stack(path: Path, item: Item, work: PageWork) -> dict[str, Any]:

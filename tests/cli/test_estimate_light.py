@@ -138,14 +138,14 @@ def test_a_picture_without_a_face_gives_a_guess_and_lights_as_one(
     assert (expected[115, 500] > 3 * expected[115, 12]).all()  # u just below 1 is the picture's left
     relit = [*models, "relight", str(PHOTO), "--landmarks", str(given / "astronaut.json"), "-o"]
     line = ["--background", str(beach), "--light-from", "background", "--light-from", f"sky={beach}"]
-    options = ["--lights", "12", "--light", "own", "--reflectance", "field"]
+    options = ["--lights", "12", "--light", "original", "--reflectance", "field"]
     assert main([*relit, str(tmp_path / "one"), *line, *options]) == 0
     by_map = ["--envmap", str(tmp_path / "beach_light.exr"), "--background", str(beach), "--exposure", "0"]
     assert main([*relit, str(tmp_path / "two"), *by_map, *options]) == 0
     one, two = (read_image(tmp_path / name / "astronaut_beach_light.exr").pixels for name in ("one", "two"))
     assert one.max() > 0
     np.testing.assert_allclose(one, two, rtol=2e-3)  # a half float's last bit: other lights are summed beside
-    assert (tmp_path / "one" / "astronaut_light_sky+own.exr").is_file()
+    assert (tmp_path / "one" / "astronaut_light_sky+original.exr").is_file()
     tiny = np.tile(sky, (8, 8, 1))  # a face of 20 pixels counts as none
     photo = read_image(PHOTO).pixels
     tiny[200:264, 300:364] = resized(photo, 64, 64)

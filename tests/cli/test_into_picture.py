@@ -33,7 +33,7 @@ def hazy(tmp_path: Path) -> Path:
     return tmp_path / "hazy.png"
 
 
-@pytest.mark.parametrize("lights", [["key=40,25", "rim=-150,15"], ["key=40,25", "own"]])
+@pytest.mark.parametrize("lights", [["key=40,25", "rim=-150,15"], ["key=40,25", "original"]])
 def test_the_wrap_is_a_layer_that_adds_up(given: Path, tmp_path: Path, hazy: Path, lights: list[str]) -> None:
     line = ["--background", hazy, *(part for light in lights for part in ("--light", light))]
     path = relit(given, tmp_path / "wrapped", *line, "--light-wrap", "0.5", "--room", "0.1")
@@ -46,7 +46,7 @@ def test_the_wrap_is_a_layer_that_adds_up(given: Path, tmp_path: Path, hazy: Pat
     added_up = (1 - matte[..., None]) * behind + sum(layers.values())
     np.testing.assert_allclose(image, added_up, atol=4 * HALF * image.max())
     assert layers["wrap"].max() > 0.1 and (layers["wrap"][matte == 0] == 0).all()
-    if "own" in layers:  # the soft view bends what is added to the photo
-        added = sum(layer for name, layer in layers.items() if name != "own")
+    if "original" in layers:  # the soft view bends what is added to the photo
+        added = sum(layer for name, layer in layers.items() if name != "original")
         shown = linear_to_srgb(read_image(path.with_suffix(".png")).pixels)
         np.testing.assert_allclose(shown, encode_display(image, SOFT_VIEW, added=added), atol=1.5 / 255)

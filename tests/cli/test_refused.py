@@ -61,10 +61,10 @@ WRONG: dict[str, dict[str, str]] = {
     "relight a.jpg": {
         "": "no light given; add --envmap, --light",
         "--light 1": "'1': no such light or key; use AZ,EL",
-        "--light own --pose 10,0,0": "--light own",
-        "--light own --composite face": "--light own",
-        "--light own --reflectance diffuse-sh": "--light own",
-        "--light even --reflectance diffuse-sh": "--light even",
+        "--light original --pose 10,0,0": "--light original",
+        "--light original --composite face": "--light original",
+        "--light original --reflectance diffuse-sh": "--light original",
+        "--light delight --reflectance diffuse-sh": "--light delight",
     },
     "relight a.jpg --light 0,0": {
         "--light-from background": "add --background FILE",

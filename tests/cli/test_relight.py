@@ -347,8 +347,8 @@ def test_near_lights_may_turn_the_head(given: Path, tmp_path: Path) -> None:
         ("0,0", "--background 0,0,0"),
         ("0,0", "--network-alone"),
         ("0,0", "--white scene"),
-        ("own", "--light"),
-        ("even", "--light"),
+        ("original", "--light"),
+        ("delight", "--light"),
         ("at=0.6,0,0.4", "--light"),
     ],
 )

@@ -71,7 +71,7 @@ def test_the_default_share_follows_the_background(background: str, share: float)
 def test_a_map_has_no_room_and_a_light_of_a_room_turns_the_default_off(sky: Path) -> None:
     (mapped,) = setups_of([], [str(sky)])
     assert in_room(mapped, None, False) == in_room(mapped, "0.5", False) == mapped
-    for entry in ("name=fill;from=around", "room=90,0"):
+    for entry in ("name=fill;from=uniform", "room=90,0"):
         (setup,) = setups_of([KEY, entry])
         assert in_room(setup, None, False) == setup
     refused(UsageError, "--room 0.1: a light is also named room", in_room, setup, "0.1", False)

@@ -52,7 +52,7 @@ def test_a_captured_stack_is_shown_by_its_own_lights(tmp_path: Path) -> None:
     assert "<title>captured.exr · facerf</title>" in made  # the input's name, not that of the page
     data = json.loads(made.partition('id="data">')[2].partition("</script>")[0])
     assert len(data["ratios"]) == 12 and data["size"] == [32, 24] and not data["background"]
-    assert "left" in data["words"] and "own" not in data["words"]  # it has no photo
+    assert "left" in data["words"] and "original" not in data["words"]  # it has no photo
     assert data["exposure"]["plate"] is None and data["source"].endswith("captured.exr")
 
 

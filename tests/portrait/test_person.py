@@ -101,11 +101,11 @@ def test_bumps_are_lit_by_their_side_and_the_photos_own_light_gives_the_photo_ba
 
 def test_bumps_change_nothing_in_the_photos_own_light(person: Person) -> None:
     view, photo = field_of(person).views[0], astronaut.photo()
-    assert view.own is not None
+    assert view.original is not None
     without = replace(view, person=replace(view.person, normals=None))
     window = Window(slice(100, 140), slice(200, 260))
     shown, plain = (
-        enlarged.over(window, photo[window])(enlarged.precompute(view.own, ("normal",)))
+        enlarged.over(window, photo[window])(enlarged.precompute(view.original, ("normal",)))
         for enlarged in map(UpsampledView, (view, without))
     )
     assert np.abs(shown["normal"] - plain["normal"]).max() > 0.2

@@ -83,7 +83,7 @@ def test_luminance_fades_where_skin_glares() -> None:
 def test_a_relit_face_keeps_the_photos_colour_detail() -> None:
     """Under white light from everywhere, the contrast of red's share on skin, at 1 to 4 pixels."""
     person, photo = astronaut.person(), astronaut.photo()
-    relit = np.asarray(person.relight(Light.around()))
+    relit = np.asarray(person.relight(Light.uniform()))
     skin = binary_erosion(person.reflectance.person.segmentation.layer("skin") > 0.9, iterations=5)
 
     def detail(image: np.ndarray) -> np.ndarray:

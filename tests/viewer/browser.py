@@ -64,7 +64,7 @@ class Drawn:
     def ev(self) -> float:
         """The exposure in the command; in the photo's own light it may have none, for 0 EV."""
         found = re.search(r"--exposure (\S+)", self.command)
-        assert found or "own" in self.command
+        assert found or "original" in self.command
         return float(found[1]) if found else 0.0
 
 

@@ -68,8 +68,8 @@ class Shown:
         """The PNG of `facerf relight` [H, W, 3]."""
         gain = np.float32(2.0**ev)
         added = None
-        if relit[0].own is not None:
-            added = gain * self.whole.light_layer([replace(relit[0], own=None)])
+        if relit[0].original_rgb is not None:
+            added = gain * self.whole.light_layer([replace(relit[0], original_rgb=None)])
         exposed = gain * self.whole.rendered(RenderRequest(relit, ev=ev))["rgb"]
         return np.round(255 * encode_display(exposed, SOFT_VIEW, self.whole.matte, added))
 
@@ -116,17 +116,17 @@ def text_of(light: torch.Tensor) -> str:
 
 RIG = on_rig((40, 25), (0, 80), (-140, 20), (180, 10))
 BETWEEN = [(40, 25), (-70, 10), (0, -40), (110, 20), (-30, 50)]
-OWN_LIGHT = Light(torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, 1, 3), own_rgb=torch.ones(1, 3))
+ORIGINAL_LIGHT = Light(torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, 1, 3), original_rgb=torch.ones(1, 3))
 PAIR = on_rig((75, 20), (-150, 10))
 COLOURED = f"light=a={text_of(PAIR[0])};rgb=1,0.5,0.25&light=b={text_of(PAIR[1])}&ev=-0.5"
 ALONE, MAP = COLOURED + "&background=none", "env=sun&rotate=50"
 BOTH = f"{MAP}&mapstops=-2&room=0.2&{COLOURED}"
 SOFT = "light=key=40,25;kelvin=3200;size_deg=40&light=fill=left;stops=-2;rgb=0.5,0.7,1"
-PRESET = "light=key=loop;stops=-1&light=room=around;stops=-4"
+PRESET = "light=key=loop;stops=-1&light=room=uniform;stops=-4"
 MAP_IN_ROOM = f"{MAP}&room=0.3"
-OWN, DIMMED = "light=own", "light=own;stops=-1&ev=1"  # as bright as the photo, both
-RIM = "light=own&light=rim=-150,15,2"
-OWN_IN_ROOM = f"light=name=day;from=own;stops=-1;kelvin=5000&light=40,25&{MAP}&room=0.2&ev=-0.5"
+ORIGINAL, DIMMED = "light=original", "light=original;stops=-1&ev=1"  # as bright as the photo, both
+RIM = "light=original&light=rim=-150,15,2"
+ORIGINAL_IN_ROOM = f"light=name=day;from=original;stops=-1;kelvin=5000&light=40,25&{MAP}&room=0.2&ev=-0.5"
 
 
 @pytest.fixture(scope="module")
@@ -135,8 +135,8 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Drawn]:
     chromium()
     addresses = [f"light={text_of(light)}" for light in RIG]
     addresses += [f"light={az},{el}&ev=1" for az, el in BETWEEN]
-    addresses += [COLOURED, ALONE, MAP, BOTH, SOFT, PRESET, MAP_IN_ROOM, RIM, OWN_IN_ROOM]
-    addresses += [f"{OWN}{more}" for more in ("", "&background=none", "&env=sun")] + [DIMMED]
+    addresses += [COLOURED, ALONE, MAP, BOTH, SOFT, PRESET, MAP_IN_ROOM, RIM, ORIGINAL_IN_ROOM]
+    addresses += [f"{ORIGINAL}{more}" for more in ("", "&background=none", "&env=sun")] + [DIMMED]
     found = drawn(shown().text, addresses, tmp_path_factory.mktemp("page"))
     return dict(zip(addresses, found, strict=True))
 
@@ -180,7 +180,7 @@ def test_lights_of_the_rig_and_between_agree_at_given_and_automatic_exposure(
     assert abs(image.ev - shown().whole.exposure_ev(relit, "auto")) < 0.03
 
 
-@pytest.mark.parametrize("address", [BOTH, SOFT, PRESET, MAP_IN_ROOM, RIM, OWN_IN_ROOM])
+@pytest.mark.parametrize("address", [BOTH, SOFT, PRESET, MAP_IN_ROOM, RIM, ORIGINAL_IN_ROOM])
 def test_the_command_makes_the_same_image(
     address: str, images: dict[str, Drawn], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -199,7 +199,7 @@ def test_the_command_makes_the_same_image(
     pixels, ev = images[address].pixels, images[address].ev
     error = shown().errors(pixels, relit, ev)
     assert error.mean() < MEAN_BETWEEN and np.percentile(error, 95) < PERCENTILE_95
-    if setup.has_own:
+    if setup.has_original:
         assert ("--exposure" in line) == ("ev=" in address) and bool(rooms) == ("room=" in address)
     elif "ev=" not in address:
         (strength,) = lights_over_rig((setup,), "150", "cell").strengths()
@@ -208,32 +208,33 @@ def test_the_command_makes_the_same_image(
 
 
 def test_the_photo_s_own_light_alone_gives_the_photo(images: dict[str, Drawn]) -> None:
-    photo = 255 * linear_to_srgb(shown().whole.image(next(shown().whole.relit(OWN_LIGHT))))
+    photo = 255 * linear_to_srgb(shown().whole.image(next(shown().whole.relit(ORIGINAL_LIGHT))))
     matte, kept = shown().whole.matte, photo_in(shown().text)
     assert np.abs(kept - photo).mean() < 1.5  # a JPEG of a grainy film
-    for address in (OWN, DIMMED):
+    for address in (ORIGINAL, DIMMED):
         pixels = images[address].pixels[..., :3]
         assert np.abs(pixels - kept)[matte > 0.01].max() <= 1
         assert np.abs(pixels - photo)[matte == 0].max() <= 1
-    alone = images[f"{OWN}&background=none"].pixels
+    alone = images[f"{ORIGINAL}&background=none"].pixels
     assert np.abs(alone[..., 3] - 255 * matte).max() < 1
     assert np.abs(alone[..., :3] - kept)[matte == 1].max() <= 1
-    assert "--light own -o out" in images[OWN].command
-    assert "--envmap envmap=maps/00000_sun.exr --light own -o out" in images[f"{OWN}&env=sun"].command
-    assert "--light 'own;stops=-1' --exposure 1 " in images[DIMMED].command
-    assert "--light 'name=rim;from=-150,15;rgb=2,2,2' --light own -o out" in images[RIM].command
+    assert "--light original -o out" in images[ORIGINAL].command
+    under_both = images[f"{ORIGINAL}&env=sun"].command
+    assert "--envmap envmap=maps/00000_sun.exr --light original -o out" in under_both
+    assert "--light 'original;stops=-1' --exposure 1 " in images[DIMMED].command
+    assert "--light 'name=rim;from=-150,15;rgb=2,2,2' --light original -o out" in images[RIM].command
 
 
 def test_without_webgl_a_smaller_image_follows_the_same_formulas(tmp_path: Path) -> None:
     chromium()
-    addresses = ["light=40,10&ev=0", "light=own;stops=1&light=40,10&room=0.06"]
+    addresses = ["light=40,10&ev=0", "light=original;stops=1&light=40,10&room=0.06"]
     relit = shown().relit(towards((40, 10)), torch.ones(1, 3))
-    for image, own in zip(
+    for image, factor in zip(
         drawn(shown().text, addresses, tmp_path, "--disable-3d-apis"), (0.0, 2.0), strict=True
     ):
         size = image.pixels.shape[:2]
         assert size == (320, 320)
-        lit = [replace(relit[0], own=torch.full((3,), own))] if own else relit
+        lit = [replace(relit[0], original_rgb=torch.full((3,), factor))] if factor else relit
         error = np.abs(resized(shown().truth(lit, 0.0), *size) - image.pixels[..., :3])
         assert error[resized(shown().whole.matte, *size) > 0.99].mean() < MEAN_BETWEEN
 
@@ -306,16 +307,16 @@ _BY_HAND = (
     seen.digits = await press("1").then(() => byId("name").value);
     seen.mirrored = await press("m");
     seen.marks = marks().map((one) => [one.ariaLabel, one.ariaPressed]);
-    seen.around = await input("around", { checked: true });
+    seen.uniform = await input("uniform", { checked: true });
     seen.roomIsIdle = byId("room").disabled;
     seen.preset = await type("presets", "split");
     seen.exposure = await type("exposureTyped", "0.5");
-    seen.ownIsIdle = byId("ownStops").disabled;
+    seen.originalIsIdle = byId("originalStops").disabled;
     await click("auto");
-    seen.own = await click("own");
-    seen.dimmed = await type("ownStopsTyped", "-1.5");
-    seen.lone = [await type("presets", "split"), byId("own").checked];
-    await click("own");
+    seen.original = await click("original");
+    seen.dimmed = await type("originalStopsTyped", "-1.5");
+    seen.lone = [await type("presets", "split"), byId("original").checked];
+    await click("original");
     seen.reset = [await click("reset"), byId("message").textContent];
     const controls = [...document.querySelectorAll("button, input:not([type=file]), select")];
     const hasLabel = (one) => one.ariaLabel || one.labels?.length || one.textContent.trim();
@@ -369,13 +370,13 @@ def test_lights_are_moved_by_hand_and_by_numbers(tmp_path: Path) -> None:
         [f"Light 1, key: azimuth 39, elevation {moved[1]:g} degrees", "true"],
         ["Light 2: azimuth 60, elevation 10 degrees", "false"],
     ]
-    assert "name=key;from=around;kelvin=3200;stops=-1.25'" in seen["around"] and seen["roomIsIdle"]
+    assert "name=key;from=uniform;kelvin=3200;stops=-1.25'" in seen["uniform"] and seen["roomIsIdle"]
     assert "--light 'name=key;from=82.15,9.69;size_deg=11.54'" in seen["preset"]
     assert "--exposure 0.5 " in seen["exposure"]
-    assert seen["ownIsIdle"] and seen["own"].endswith(" --light own -o out")
-    assert seen["dimmed"].endswith(" --light 'own;stops=-1.5' -o out")
-    assert "own" not in seen["lone"][0] and not seen["lone"][1]
-    assert "--light 40,25 " in seen["reset"][0] and "own" not in seen["reset"][0]
+    assert seen["originalIsIdle"] and seen["original"].endswith(" --light original -o out")
+    assert seen["dimmed"].endswith(" --light 'original;stops=-1.5' -o out")
+    assert "original" not in seen["lone"][0] and not seen["lone"][1]
+    assert "--light 40,25 " in seen["reset"][0] and "original" not in seen["reset"][0]
     assert "--exposure 0.5" not in seen["reset"][0]
     assert seen["reset"][1] == "" and seen["unlabelled"] == []
 
@@ -386,7 +387,7 @@ def test_an_address_that_cannot_be_shown_says_so(tmp_path: Path) -> None:
         _ACTIONS
         + """
     const seen = [];
-    const [many, twice] = ["light=" + "1,1;".repeat(12), "light=own&light=from=own"];
+    const [many, twice] = ["light=" + "1,1;".repeat(12), "light=original&light=from=original"];
     for (const address of ["light=foo", "light=at=0,0,1", "env=moon", many, twice, "light=key=40,20"]) {
       document.body.dataset.settled = "";
       location.hash = address;
@@ -402,7 +403,7 @@ def test_an_address_that_cannot_be_shown_says_so(tmp_path: Path) -> None:
         ("A near light is shown as a far one", "--light 0,0"),
         ("env=moon: give sun", "--light 40,25"),
         ("The first 9 of 12 lights", "--light '1,1;1,1;1,1;"),
-        ("The photo's own light is given twice", "--light own -o"),
+        ("The original light occurs twice", "--light original -o"),
         ("", "--light key=40,20"),
     ]
     for (message, command), (said, line) in zip(found, wanted, strict=True):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from facerf_cli import viewer
-from facerf_cli.light.entries import EVEN, OWN, WORDS, StudioLight, lit_images
+from facerf_cli.light.entries import DELIGHT, ORIGINAL, WORDS, StudioLight, lit_images
 from facerf_cli.light.light import far_samples, intensity_of
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.viewer.page import packed_lights
@@ -37,10 +37,10 @@ ONE = [
     "from=0,90;size_deg=60",
     "0,89.9;size_deg=3",
     "from=-140,40;size_deg=120",
-    "from=around;stops=-5;kelvin=4000",
-    "own",
-    "own;stops=-1.5;kelvin=5000",
-    "name=day;from=own;rgb=1,0.9,0.8",
+    "from=uniform;stops=-5;kelvin=4000",
+    "original",
+    "original;stops=-1.5;kelvin=5000",
+    "name=day;from=original;rgb=1,0.9,0.8",
 ]
 MANY = ["40,25;-60,10,2", "key=40,20;rim=160,10,0.5", *("beauty", "rembrandt", "rim")]
 FREE = {  # forms that are one with others
@@ -51,7 +51,7 @@ FREE = {  # forms that are one with others
     "below": "0,-90",
     "behind": "180,0",
     "from=front;size_deg=20": "from=0,0;size_deg=20",
-    "around": "from=around",
+    "uniform": "from=uniform",
     "at=0.6,0.8,1;size=0.5": "from=30.9637565321,34.4499019880;size_deg=20.0499757242",
     "at=0,0,-2": "180,0",
 }
@@ -97,7 +97,7 @@ def assert_is(given: dict[str, Any], lights: tuple[StudioLight, ...]) -> None:
     assert len(given["lights"]) == len(lights)
     for one, samples, rgb, light in zip(given["lights"], given["samples"], given["rgb"], lights, strict=True):
         np.testing.assert_allclose(rgb, intensity_of(light), rtol=2e-4, atol=1e-6)
-        assert one["around"] == light.is_around and one["own"] == light.own
+        assert one["uniform"] == light.is_uniform and one["original"] == light.original
         if light.at_m is not None:
             toward = np.array(light.at_m) / np.linalg.norm(light.at_m)
             np.testing.assert_allclose(azel_to_direction(one["azimuth"], one["elevation"]), toward, atol=1e-6)
@@ -123,26 +123,30 @@ def test_the_text_of_lights_gives_them_again(text: str, found: dict[str, Any]) -
     for one, rgb, light in zip(given["lights"], given["rgb"], image.frames[0], strict=True):
         where = (
             None
-            if one["around"] or one["own"]
+            if one["uniform"] or one["original"]
             else pytest.approx((one["azimuth"], one["elevation"]), abs=6e-3)
         )
-        assert light.azel_deg == where and light.own == one["own"]  # texts have two decimals
+        assert light.azel_deg == where and light.original == one["original"]  # texts have two decimals
         assert light.size_deg == pytest.approx(one["size"], abs=6e-3)
         np.testing.assert_allclose(intensity_of(light), rgb, rtol=1e-3, atol=1e-6)
 
 
 @pytest.mark.parametrize(
     ("text", "written"),
-    [("own", "own"), ("own;stops=-1.5;kelvin=5000", "own;kelvin=5000;stops=-1.5"), (ONE[-1], ONE[-1])],
+    [
+        ("original", "original"),
+        ("original;stops=-1.5;kelvin=5000", "original;kelvin=5000;stops=-1.5"),
+        (ONE[-1], ONE[-1]),
+    ],
 )
-def test_the_photo_s_own_light_is_written_by_its_word(text: str, written: str, found: dict[str, Any]) -> None:
+def test_the_original_light_is_written_by_its_word(text: str, written: str, found: dict[str, Any]) -> None:
     assert found[text]["texts"] == [written]
 
 
 def test_every_word_is_packed_and_keys_of_a_preset_act_on_all_of_its_lights(found: dict[str, Any]) -> None:
     assert set(packed_lights(True)["words"]) == set(WORDS)
-    assert set(WORDS) - set(packed_lights(False)["words"]) == {OWN, EVEN}
-    assert packed_lights(True, 1.5)["words"][EVEN]["rgb"] == (1.5, 1.5, 1.5)
+    assert set(WORDS) - set(packed_lights(False)["words"]) == {ORIGINAL, DELIGHT}
+    assert packed_lights(True, 1.5)["words"][DELIGHT]["rgb"] == (1.5, 1.5, 1.5)
     lights = found["key=rembrandt;stops=-1;rgb=1,0.5,0.5"]["lights"]
     assert [(one["name"], one["stops"]) for one in lights] == [("key_key", -1), ("key_fill", -8.5)]
     assert all(one["rgb"] == [1, 0.5, 0.5] for one in lights)

@@ -284,7 +284,7 @@ def test_lights_by_their_keys_and_by_the_names_of_presets() -> None:
     far = StudioLight((40.0, 20.0), kelvin=5600.0, stops=-1.0, size_deg=30.0)
     assert single("from=40,20; kelvin=5600 ;stops=-1;size_deg=30") == far
     assert single("40,20,2") == single("from=40,20,2") == StudioLight((40.0, 20.0), rgb=(2.0, 2.0, 2.0))
-    assert single("from=around;stops=-3") == StudioLight(stops=-3.0)
+    assert single("from=uniform;stops=-3") == StudioLight(stops=-3.0)
     assert single("at=0,0,1;size=0") == StudioLight(at_m=(0.0, 0.0, 1.0))
     assert lit_images(["rim"])[0].names == ("right", "left", "fill")
     assert lit_images(["rim=-150,15"])[0].frames == ((StudioLight((-150.0, 15.0)),),)
@@ -416,7 +416,7 @@ def test_sweeps_number_their_frames_and_other_lights_shine_in_each() -> None:
         ("name=a;az=20", "use from=20,0"),
         ("a=40,20,1,2,3", "use 40,20;rgb=1,2,3"),
         ("from=0,0:200:4", "use -90 (below) to 90 (above)"),
-        ("from=around;size_deg=3", "size_deg ... far lights (from=AZ,EL)"),
+        ("from=uniform;size_deg=3", "size_deg ... far lights (from=AZ,EL)"),
         ("at=0,0,1;rotate=30", "rotate ... maps (map=); remove it"),
         ("from=20,0;face=1.5", "face '1.5': use a whole number"),
         ("name=;at=0,0,1", "'': use a different name"),
@@ -433,10 +433,13 @@ def test_sweeps_number_their_frames_and_other_lights_shine_in_each() -> None:
         ("key=rembrandt;size=3", "size ... near lights ... remove it"),
         ("from=up", "from 'up' ... use AZ,EL or one of left, right"),
         ("missing.toml", "missing.toml ... check the path"),
-        ("own;at=0,0,1", "use a separate --light for each light"),
-        ("own;size=1", "size ... near lights ... remove it"),
-        ("own;size_deg=5", "size_deg ... far lights ... remove it"),
-        ("own;rotate=5", "rotate ... maps (map=); remove it"),
+        ("original;at=0,0,1", "use a separate --light for each light"),
+        ("original;size=1", "size ... near lights ... remove it"),
+        ("original;size_deg=5", "size_deg ... far lights ... remove it"),
+        ("original;rotate=5", "rotate ... maps (map=); remove it"),
+        ("own;stops=1", "'own': no such light; use original"),
+        ("even", "'even': no such light; use delight"),
+        ("name=a;from=around", "'around': no such light; use uniform"),
     ],
 )
 def test_faults_say_what_to_give(entry: str, said: str) -> None:
@@ -464,6 +467,7 @@ def test_a_rig_file_is_one_image_with_a_layer_for_each_light(tmp_path: Path) -> 
         ("[key]\nat = [0, 0]\n", "key: at '0.0,0.0' ... use X,Y,Z"),
         ("['a b']\nat = [0, 0, 1]\n", "'a b': use a different name"),
         ("[key]\nfrom = 'up'\n", "key: from 'up' ... use AZ,EL or one of left, right"),
+        ("[key]\nfrom = 'own'\n", "key: from 'own': no such light; use original"),
         ("[a]\nfrom = '0:9:2,0'\n[b]\nfrom = '0:9:3,0'\n", "use the same N"),
     ],
 )
@@ -491,7 +495,7 @@ def test_near_lights_are_kept_apart_from_far_ones_and_prepared_once() -> None:
 
 def test_strengths_count_all_light_wherever_it_comes_from(tmp_path: Path) -> None:
     write_exr(tmp_path / "even.exr", np.full((16, 32, 3), 0.5, np.float32))
-    entries = ["0,0,3", "180,0", "at=0,0,1;stops=1", "from=around"]
+    entries = ["0,0,3", "180,0", "at=0,0,1;stops=1", "from=uniform"]
     setups = collect_setups(LightSources(envmap=[str(tmp_path / "even.exr")], light=entries), Path("out"))
     assert lights_over_rig(setups, "150", "cell").strengths() == pytest.approx(
         [2, 3, 1, 2, 4], rel=1e-3
