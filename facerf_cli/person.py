@@ -203,7 +203,7 @@ class Person:
         pose: Pose | None = None,
         background: Background = "photo",
         layers: Sequence[str] = (),
-        room: float = 0.0,
+        ambient: float = 0.0,
         alone: bool = False,
     ) -> Any:
         """Relight the person and return the image [H, W, 3] in the frame of the photo.
@@ -215,7 +215,7 @@ class Person:
                 is scaled to cover the frame; or a colour (r, g, b).
             layers: Names of layers, as for `facerf relight --aov`. The result is then a dict of "image" and
                 the layers [H, W] or [H, W, C].
-            room: Fraction, 0 to 1, of all lights but maps that a white room reflects as ambient fill.
+            ambient: Uniform ambient fill, as a fraction from 0 to 1 of all lights except maps.
             alone: Render only the face, in the pose of the photo, as [H, W, 4].
 
         Gradients flow to the lights, the pose and the texture if only the face is rendered (docs/python.md).
@@ -225,8 +225,8 @@ class Person:
                 with `pose` or `alone`.
         """
         if not alone and pose is None:
-            return self._group.relight(light, background, layers, room)
-        lights = _lights_of(light, room)
+            return self._group.relight(light, background, layers, ambient)
+        lights = _lights_of(light, ambient)
         if any(one.original_rgb is not None for one in lights):
             raise UsageError("Light.original(): lights the whole photo; remove pose and alone")
         _check_layers(layers, FACE_LAYERS)
@@ -518,10 +518,10 @@ class Group:
         light: Light | Array | Sequence[Light | Array],
         background: Background = "photo",
         layers: Sequence[str] = (),
-        room: float = 0.0,
+        ambient: float = 0.0,
     ) -> Any:
         """Relight all people with the same light and return one image; see `Person.relight`."""
-        lights, kinds = _lights_of(light, room), {person.kind for person in self.people}
+        lights, kinds = _lights_of(light, ambient), {person.kind for person in self.people}
         if not kinds <= {"portrait", "field"} and any(one.original_rgb is not None for one in lights):
             raise UsageError("Light.original(): unsupported by comparison models; use reflectance='field'")
         _check_layers(layers, [*FACE_LAYERS, *(PERSON_LAYERS if kinds == {"portrait"} else ())])
@@ -568,8 +568,8 @@ def _under_each(subject: Relightable, directions: Tensor) -> np.ndarray:
     return images
 
 
-def _lights_of(light: Any, room: float) -> list[Light]:
-    return [as_light(one, room) for one in (light if isinstance(light, Sequence) else [light])]
+def _lights_of(light: Any, ambient: float) -> list[Light]:
+    return [as_light(one, ambient) for one in (light if isinstance(light, Sequence) else [light])]
 
 
 def _arrays_of(lights: Sequence[Light]) -> list[Any]:

@@ -84,10 +84,10 @@ def test_the_page_runs_and_its_shapes_are_true(page: dict[str, Any]) -> None:
 
 @pytest.mark.slow
 def test_it_gives_what_the_command_line_gives(page: dict[str, Any], tmp_path: Path) -> None:
-    line = ["relight", str(PHOTO), "--light", "60,30", "--room", "0.06", "--exposure", "0"]
+    line = ["relight", str(PHOTO), "--light", "60,30", "--ambient", "0.06", "--exposure", "0"]
     assert main([*line, "-o", str(tmp_path)]) == 0
     written = facerf.read_image(tmp_path / "astronaut_light_60_30.exr")
-    relit = page["person"].relight(KEY, room=0.06)
+    relit = page["person"].relight(KEY, ambient=0.06)
     np.testing.assert_array_equal(written, relit.astype(np.float16).astype(np.float32))
     row = only_row(tmp_path)
     assert set(row["factors"]) == set(SCALES) - {"masked"}  # which judges a given matte
@@ -107,7 +107,7 @@ def test_a_group_is_relit_as_on_the_command_line(tmp_path: Path) -> None:
     one = astronaut.photo()
     both = np.hstack([one, np.full_like(one[:, :100], 0.2), one[:, ::-1]])
     facerf.write_image(tmp_path / "both.exr", both)
-    line = ["relight", str(tmp_path / "both.exr"), "--face", "all", "--light", "60,30", "--room", "none"]
+    line = ["relight", str(tmp_path / "both.exr"), "--face", "all", "--light", "60,30", "--ambient", "none"]
     line += ["--background", "none", "--aov", "depth", "--exposure", "0", "-o", str(tmp_path / "out")]
     assert main([*line, "--reflectance", "field"]) == 0
     (written,) = (tmp_path / "out").glob("*.exr")
@@ -210,7 +210,7 @@ def test_what_cannot_be_used_is_said(person: facerf.Person) -> None:
     refused(ValueError, "not finite", facerf.fit, models, np.full((200, 300, 3), np.nan, np.float32))
     refused(TypeError, "read a file with read_image", facerf.fit, models, str(PHOTO))
     refused(InputError, "twice as wide as high", person.relight, np.ones((30, 40, 3), np.float32))
-    refused(ValueError, "room is 'none', not a fraction from 0 to 1", person.relight, KEY, room="none")
+    refused(ValueError, "ambient is 'none', not a fraction from 0 to 1", person.relight, KEY, ambient="none")
     refused(ValueError, "pose is", person.relight, KEY, pose=(math.nan, 0, 0))
     with pytest.raises(ValueError, match=r"not a list of some of normal, position, depth, uv, face$"):
         person.relight(KEY, layers=["albedo"])

@@ -63,7 +63,7 @@ COMMANDS = {
     },
     "before_wall": {
         "relight {photo} --background {folder}/wall.png --light-wrap 0.3 --light-from background"
-        " --light-from room=background --light key=60,25": "wall_light.png light_room+key.png"
+        " --light-from ambient=background --light key=60,25": "wall_light.png light_ambient+key.png"
     },
     "rigs": {
         f"relight {{photo}} --background 0,0,0 --light {' --light '.join(PRESETS)}": (

@@ -249,7 +249,7 @@ class YaleOptions(FieldOptions, EvaluateOptions):
         shifts: CSV of subject,light,dy,dx: pixels down and to the right that align an image with its
             subject's frontal image.
         subjects: Measure only these subjects, such as yaleB05,yaleB15. Repeatable.
-        room: Uniform ambient light added to each flash, as a fraction of the flash.
+        ambient: Uniform ambient light added to each flash, as a fraction of the flash.
     """
 
     reflectance: tuple[RelightKind, ...] = _kinds("portrait")
@@ -263,7 +263,7 @@ class YaleOptions(FieldOptions, EvaluateOptions):
         parse=lambda texts: tuple(name.strip() for text in texts for name in text.split(",") if name.strip()),
         panel=DATA,
     )
-    room: float = option(0.0, metavar="SHARE", least=0.0, most=1.0, panel=DATA)
+    ambient: float = option(0.0, metavar="SHARE", least=0.0, most=1.0, panel=DATA)
 
 
 @dataclass(frozen=True)

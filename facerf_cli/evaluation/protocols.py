@@ -69,8 +69,8 @@ def notes(options: EvaluateOptions, chosen: Chosen) -> Iterator[str]:
         yield f"The mean face is rendered by {trained}; both faces are compared where both are visible."
     if isinstance(options, YaleOptions):
         database, _ = next(iter(chosen.items.values()))
-        if options.room:
-            yield f"Each flash is accompanied by uniform light of {options.room:.3g} times its own (--room)."
+        if options.ambient:
+            yield f"Each flash has uniform light of {options.ambient:.3g} times the flash (--ambient)."
         aligned = (
             "aligned with their subject's frontal image (--shifts)" if database.shifts else "not aligned"
         )

@@ -176,7 +176,7 @@ def compare_subject(options: YaleOptions, bench: Bench, subject: tuple[YaleB, st
     for source in dict.fromkeys(relighting.source for relighting in relightings):
         of_source = [relighting for relighting in relightings if relighting.source == source]
         photo = _rgb(images.image(source))
-        lights = _lights(images, of_source, options.room)
+        lights = _lights(images, of_source, options.ambient)
         relit = {
             method.name: [
                 image.mean(-1).clip(min=0) for image in method.images(photo, head, lights, Target())
@@ -199,14 +199,14 @@ def _rgb(grey: np.ndarray) -> np.ndarray:
     return np.repeat(grey[..., None], 3, -1).astype(np.float32)
 
 
-def _lights(subject: YaleSubject, relightings: Sequence[Relighting], room: float) -> Light:
-    """Return the targets as sums of flashes, each with uniform light of the fraction `room`."""
+def _lights(subject: YaleSubject, relightings: Sequence[Relighting], ambient: float) -> Light:
+    """Return the targets as sums of flashes, each with uniform light of the fraction `ambient`."""
     weights = torch.from_numpy(np.stack([subject.weights(target.light) for target in relightings])).float()
     used = weights.sum(0) > 0
     directions = torch.from_numpy(np.stack([flash.direction for flash in subject.flashes])).float()[used]
     weights = weights[:, used]
-    if room:
+    if ambient:
         around, weight = far_samples(StudioLight())
         directions = torch.cat([directions, around])
-        weights = torch.cat([weights, room * weight * weights.sum(1, keepdim=True)], 1)
+        weights = torch.cat([weights, ambient * weight * weights.sum(1, keepdim=True)], 1)
     return Light(directions, weights[..., None].expand(-1, -1, 3))

@@ -236,15 +236,15 @@ class Light:
         return [float(value) for value in luminance(total.numpy())]
 
 
-def as_light(light: Any, room: float = 0.0) -> Light:
-    """Convert a light or a map [H, 2 H, 3]; `room` adds uniform light of this fraction of a light's sum.
+def as_light(light: Any, ambient: float = 0.0) -> Light:
+    """Convert a light or a map [H, 2 H, 3]; `ambient` adds uniform light of this fraction of a light's sum.
 
     Raises TypeError for another type.
     """
-    if not (isinstance(room, (int, float)) and 0 <= room <= 1):
-        raise ValueError(f"room is {room!r}, not a fraction from 0 to 1")
+    if not (isinstance(ambient, (int, float)) and 0 <= ambient <= 1):
+        raise ValueError(f"ambient is {ambient!r}, not a fraction from 0 to 1")
     if isinstance(light, Light):
-        return light + Light.uniform() * (room * light.weights.sum(0)) if room else light
+        return light + Light.uniform() * (ambient * light.weights.sum(0)) if ambient else light
     if isinstance(light, np.ndarray | Tensor) and light.ndim == 3:
         return Light.from_envmap(light)
     kind = f"has shape {list(light.shape)}" if hasattr(light, "shape") else f"is {type(light).__name__}"

@@ -16,7 +16,7 @@ from facerf_cli.files.image_metadata import read_header
 from facerf_cli.light.entries import Sampling, StudioLight
 from facerf_cli.light.envmap import NO_KEYS, lights_around, rotated_weights, turned, without_keys
 from facerf_cli.light.light import Light, far_samples, intensity_of, is_narrow, rig_by_text
-from facerf_cli.light.setups import ROOM, LightSetup
+from facerf_cli.light.setups import AMBIENT, LightSetup
 from facerf_cli.run.logs import LOGGER_NAME, step
 
 _CLIPPED = 2.0  # linear Rec.709: display values of any gamut are below it
@@ -120,14 +120,14 @@ def _original_weights(setups: Sequence[LightSetup]) -> Tensor | None:
     return torch.stack([sum(factors, torch.zeros(3)) for factors in each]) if any(each) else None
 
 
-def with_room(setup: LightSetup) -> LightSetup:
+def with_ambient(setup: LightSetup) -> LightSetup:
     """Return the setup with its ambient fill as one more light."""
-    if not setup.room:
+    if not setup.ambient:
         return setup
     lights = [light for light in setup.lights if light.envmap is None and not light.original]
     total = torch.stack([intensity_of(light) for light in lights]).sum(0)
-    red, green, blue = (setup.room * float(value) for value in total)
-    names = (*setup.names, ROOM) if setup.names else ()
+    red, green, blue = (setup.ambient * float(value) for value in total)
+    names = (*setup.names, AMBIENT) if setup.names else ()
     return replace(setup, lights=(*setup.lights, StudioLight(rgb=(red, green, blue))), names=names)
 
 
@@ -136,7 +136,7 @@ def as_lit(setups: Sequence[LightSetup], face: int, uniform: float = 1.0) -> tup
 
     A setup whose lights have names is followed by one setup for each of its lights.
     """
-    lit = [with_room(setup.on_person(face, uniform)) for setup in setups]
+    lit = [with_ambient(setup.on_person(face, uniform)) for setup in setups]
     each = [[replace(setup, lights=(light,)) for light in setup.lights if setup.names] for setup in lit]
     return tuple(setup for whole, parts in zip(lit, each, strict=True) for setup in (whole, *parts))
 

@@ -5,7 +5,7 @@ from typing import Self
 
 from facerf_cli.light.entries import StudioLight
 
-ROOM = "room"  # name of the ambient fill, and of its layer
+AMBIENT = "ambient"  # name of the ambient fill, and of its layer
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,7 @@ class LightSetup:
         frame: Frame number that ends the file name, such as '.0001'; '' for a still.
         lights: The lights, each of them with its own intensity.
         names: One name per light, if each light is also a layer of the image.
-        room: Ambient fill as a fraction of the sum of the single lights.
+        ambient: Ambient fill as a fraction of the sum of the single lights.
         exposure_ev: Exposure of the image if the user does not choose one; None: chosen automatically.
     """
 
@@ -25,7 +25,7 @@ class LightSetup:
     frame: str = ""
     lights: tuple[StudioLight, ...] = ()
     names: tuple[str, ...] = ()
-    room: float = 0.0
+    ambient: float = 0.0
     exposure_ev: float | None = None
 
     @property

@@ -188,18 +188,18 @@ class CanvasView {
   }
 }
 
-// A grey ball seen from the front, matte, under weights [lights * 3] of lights, and of a room.
+// A grey ball seen from the front, matte, under weights [lights * 3] of lights, and of ambient fill.
 function drawBall(canvas, lights, weights) {
   const { width } = canvas;
   const context = canvas.getContext("2d");
   const shown = context.createImageData(width, width);
   const on = lights.map((light, i) => [light, weights.subarray(3 * i, 3 * i + 3)]).filter(([, rgb]) => rgb.some(Boolean));
-  const room = [...weights.subarray(3 * lights.length)].map((value) => (BALL * value) / 4);
+  const ambient = [...weights.subarray(3 * lights.length)].map((value) => (BALL * value) / 4);
   for (let i = 0; i < width * width; i++) {
     const [x, y] = [(2 * (i % width) + 1) / width - 1, 1 - (2 * Math.floor(i / width) + 1) / width];
     if (x * x + y * y > 1) continue;
     const normal = [x, y, Math.sqrt(1 - x * x - y * y)];
-    const sum = room.length ? [...room] : [0, 0, 0];
+    const sum = ambient.length ? [...ambient] : [0, 0, 0];
     for (const [light, rgb] of on) {
       const cosine = BALL * Math.max(0, dot(normal, light));
       sum[0] += cosine * rgb[0];

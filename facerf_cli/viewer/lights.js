@@ -4,7 +4,7 @@ const MOST_LIGHTS = 9;
 const WHITE_K = 6504; // of D65
 const [APART_DEG, MOST_A_SIDE] = [6, 6]; // samples of a soft light (light/light.py)
 const XYZ_TO_RGB = [[3.2404542, -1.5371385, -0.4985314], [-0.969266, 1.8760108, 0.041556], [0.0556434, -0.2040259, 1.0572252]];
-const [ROOM, ORIGINAL] = ["room", "original"]; // names of a light that stands for the room, and of the photo's original light
+const [AMBIENT, ORIGINAL] = ["ambient", "original"]; // names of the ambient fill and of the original light
 // Numbers of the keys of a light, and their limits; those of a page, and others of --light, which it cannot show.
 const KEYS = {
   at: [3, -1e4, 1e4], from: [2, -1e5, 1e5], rgb: [3, 0, 1e6], kelvin: [1, 1667, 25000], stops: [1, -20, 20],

@@ -12,15 +12,15 @@ const CONTROLS = {
     size: ["Softness", "°", 0, 120, 1],
   },
   original: { originalStops: ["Original light", "stops", -6, 6, 0.1, -20, 20] },
-  room: { room: ["Room", "%", 0, 30, 1, 0, 100] },
+  ambient: { ambient: ["Ambient", "%", 0, 30, 1, 0, 100] },
   map: { rotate: ["Rotate", "°", -180, 180, 1], mapStops: ["Intensity", "stops", -6, 6, 0.1] },
   image: { exposure: ["Exposure", "EV", -6, 8, 0.05, -20, 20] },
 };
-const SHOWN = { room: 100 }; // a value in the state, times this, is that of its control
+const SHOWN = { ambient: 100 }; // a value in the state, times this, is that of its control
 const MARK_MARGIN = 14; // pixels that a mark keeps from the edge of the picture
 const BEHIND = 1.98; // how far from the head's middle a light can be dragged, where 1 is its outline and 2 behind it
 
-// Read #light=key=40,20;stops=-1&light=rim&room=0.1&env=studio&rotate=30&mapstops=-1&ev=-0.5&background=none&compare=50
+// Read #light=key=40,20;stops=-1&light=rim&ambient=0.1&env=studio&rotate=30&mapstops=-1&ev=-0.5&background=none&compare=50
 function stateOf(address, maps, data) {
   const given = new URLSearchParams(address.hash.length > 1 ? address.hash.slice(1) : address.search);
   const number = (name, low, high) => {
@@ -28,7 +28,7 @@ function stateOf(address, maps, data) {
     return Number.isFinite(value) ? limited(value, low, high) : null;
   };
   const named = (name) => maps.find((map) => map.name === given.get(name));
-  const map = named("env") ?? named("room") ?? null; // a map may be the room
+  const map = named("env") ?? named("ambient") ?? null; // a map may be the ambient light
   const found = { lights: map ? [] : [newLight({ azimuth: 40, elevation: 25 })], original: [], message: "" };
   try {
     if (given.has("light")) {
@@ -48,7 +48,7 @@ function stateOf(address, maps, data) {
     original: found.original[0] ?? null, // the photo's original light
     message: found.message,
     selected: 0,
-    room: named("room") || given.get("room") === "none" ? 0 : number("room", 0, 1), // null: by the background
+    ambient: named("ambient") || given.get("ambient") === "none" ? 0 : number("ambient", 0, 1), // null: by the background
     map,
     rotate: turned(number("rotate", -3600, 3600) ?? 0),
     mapStops: number("mapstops", -6, 6) ?? 0,
@@ -64,9 +64,9 @@ const NEAR = "A near light is shown as a far one from its side; the command name
 const allOf = ({ lights, original }) => (original ? [...lights, original] : lights);
 
 function addressOf(state) {
-  const { room, map, rotate, mapStops, exposure, background, compare } = state;
+  const { ambient, map, rotate, mapStops, exposure, background, compare } = state;
   const parts = textsOf(allOf(state)).map((text) => "light=" + text);
-  if (room !== null) parts.push("room=" + rounded(room, 4));
+  if (ambient !== null) parts.push("ambient=" + rounded(ambient, 4));
   if (map?.command) {
     parts.push("env=" + map.name);
     if (rotate) parts.push("rotate=" + rotate);
@@ -78,31 +78,31 @@ function addressOf(state) {
   return "#" + parts.join("&");
 }
 
-// The share that comes from all around, as `facerf relight` has it: of the lights; of a map alone where it is asked for.
-function roomOf({ room, background, lights, map, original }, data) {
-  if (!data.room || hasRoom(lights) || !(lights.length || map)) return 0;
-  return room ?? (original || !lights.length ? 0 : background && data.background ? data.room.bright : data.room.dark);
+// Ambient fill as a fraction of the lights, as in `facerf relight`; of a map on its own only if it is set.
+function ambientOf({ ambient, background, lights, map, original }, data) {
+  if (!data.ambient || hasAmbient(lights) || !(lights.length || map)) return 0;
+  return ambient ?? (original || !lights.length ? 0 : background && data.background ? data.ambient.bright : data.ambient.dark);
 }
 
-// True where a light stands for the room.
-const hasRoom = (lights) => lights.some(({ uniform, name }) => uniform || name === ROOM);
+// True if a light replaces the ambient fill.
+const hasAmbient = (lights) => lights.some(({ uniform, name }) => uniform || name === AMBIENT);
 
 // The command lines that make the same image; a map shines together with lights where all have names.
-function commandOf(state, data, ev, ofRoom) {
-  const { map, lights, original, room, rotate, mapStops, background } = state;
+function commandOf(state, data, ev, ofAmbient) {
+  const { map, lights, original, ambient, rotate, mapStops, background } = state;
   if (!map && !lights.length && !original) return "# add a light, or choose an environment";
   const quoted = (text) => (/^[\w@%+=:,./-]+$/.test(text) ? text : "'" + text.replaceAll("'", `'"'"'`) + "'");
-  const roomOfMap = !lights.length && ofRoom.some(Boolean);
-  const both = Boolean(map && (lights.length || original || roomOfMap));
+  const ambientOfMap = !lights.length && ofAmbient.some(Boolean);
+  const both = Boolean(map && (lights.length || original || ambientOfMap));
   const keys = [`map=${map?.path}`, rotate && `rotate=${rotate}`, mapStops && `stops=${mapStops}`];
   const asLight = both && mapStops; // which --envmap has none of
   const texts = asLight ? [["name=envmap", ...keys.filter(Boolean)].join(";")] : [];
   texts.push(...textsOf(allOf(state), both));
-  if (roomOfMap) texts.push(`name=${ROOM};${partsOf(newLight({ uniform: true, rgb: ofRoom })).keys}`);
+  if (ambientOfMap) texts.push(`name=${AMBIENT};${partsOf(newLight({ uniform: true, rgb: ofAmbient })).keys}`);
   let line = `facerf relight ${data.source}`;
   if (map && !asLight) line += ` --envmap ${quoted((both ? "envmap=" : "") + map.path)}` + (rotate ? ` --rotate ${rotate}` : "");
   line += texts.map((text) => ` --light ${quoted(text)}`).join("");
-  if (lights.length && data.room && room !== null && !hasRoom(lights) && (room || !original)) line += ` --room ${rounded(room, 4) || "none"}`;
+  if (lights.length && data.ambient && ambient !== null && !hasAmbient(lights) && (ambient || !original)) line += ` --ambient ${rounded(ambient, 4) || "none"}`;
   const exposure = rounded(ev + (map && !both ? mapStops : 0), 2); // stops of a map alone are exposure
   if (exposure || !original) line += ` --exposure ${exposure}`;
   if (data.background && !background) line += " --background none";
@@ -142,7 +142,7 @@ class Page {
     byId("before").src = images.photo.src;
     byId("frame").style.setProperty("--sides", data.size[0] / data.size[1]);
     byId("background").hidden = !data.background;
-    byId("uniformRow").hidden = byId("roomRows").hidden = !data.room;
+    byId("uniformRow").hidden = byId("ambientRows").hidden = !data.ambient;
     for (const [section, controls] of Object.entries(CONTROLS)) {
       byId(`${section}Rows`).append(...Object.entries(controls).map(([id, control]) => this.row(id, control)));
     }
@@ -216,7 +216,7 @@ class Page {
     this.change({});
   }
 
-  // Weights [images * 3] of all that shines; the last image is that of a room, whose directions send 4 times as much.
+  // Weights [images * 3] of all that shines; the last image is under ambient fill, 4 times as strong.
   weights() {
     const { lights, map, rotate, mapStops } = this.state;
     const key = map && `${this.maps.indexOf(map)} ${rotate}`;
@@ -233,8 +233,8 @@ class Page {
         for (const [i, share] of this.rig.sharesOf(samplesOf(light))) rgb.forEach((value, c) => (weights[3 * i + c] += share * value));
       }
     }
-    this.ofRoom = sent.map((value) => value * roomOf(this.state, this.data));
-    this.ofRoom.forEach((value, c) => (weights[last + c] += 4 * value));
+    this.ofAmbient = sent.map((value) => value * ambientOf(this.state, this.data));
+    this.ofAmbient.forEach((value, c) => (weights[last + c] += 4 * value));
     return weights;
   }
 
@@ -260,7 +260,7 @@ class Page {
     this.show(CONTROLS.light, light ?? newLight(), (id) => !light || (uniform && ["azimuth", "elevation", "size"].includes(id)));
     this.show(CONTROLS.original, { originalStops: state.original?.stops ?? 0 }, () => !state.original);
     byId("original").checked = Boolean(state.original);
-    this.show(CONTROLS.room, { room: roomOf(state, data) }, () => hasRoom(state.lights) || !(light || state.map));
+    this.show(CONTROLS.ambient, { ambient: ambientOf(state, data) }, () => hasAmbient(state.lights) || !(light || state.map));
     this.show(CONTROLS.map, state, () => !state.map);
     this.show(CONTROLS.image, { exposure: this.ev }, () => false);
     byId("envmap").value = this.maps.indexOf(state.map);
@@ -273,7 +273,7 @@ class Page {
     const pressed = { auto: state.exposure === null, background: state.background, compare: state.compare !== null };
     for (const [id, is] of Object.entries(pressed)) byId(id).ariaPressed = String(is);
     this.showLights();
-    byId("command").textContent = commandOf(state, data, this.ev, this.ofRoom);
+    byId("command").textContent = commandOf(state, data, this.ev, this.ofAmbient);
     for (const id of ["before", "split", "sides"]) byId(id).hidden = state.compare === null;
     byId("before").style.clipPath = `inset(0 ${100 - state.compare}% 0 0)`;
     byId("split").value = state.compare;

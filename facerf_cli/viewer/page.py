@@ -21,10 +21,10 @@ from facerf_cli.image.colour import (
     linear_to_srgb,
 )
 from facerf_cli.light.entries import (
+    AMBIENT_OVER_BRIGHT,
+    AMBIENT_OVER_DARK,
     DELIGHT,
     ORIGINAL,
-    ROOM_BEFORE_BRIGHT,
-    ROOM_BEFORE_DARK,
     WORDS,
     lit_images,
     preset_names,
@@ -77,7 +77,7 @@ def packed(basis: Basis, plate: Plate, head: Sequence[float], maps: Sequence[Pag
     height, width = plate.matte.shape
     background = np.zeros_like(plate.before) if plate.background is None else plate.background
     # Ambient fill over bright and dark backgrounds; OLAT stacks have none.
-    room = {"bright": ROOM_BEFORE_BRIGHT, "dark": ROOM_BEFORE_DARK}
+    ambient = {"bright": AMBIENT_OVER_BRIGHT, "dark": AMBIENT_OVER_DARK}
     return {
         "size": [width, height],
         "small": [basis.ratios.shape[2], basis.ratios.shape[1]],
@@ -91,7 +91,7 @@ def packed(basis: Basis, plate: Plate, head: Sequence[float], maps: Sequence[Pag
         "photo": _jpeg(_encoded(plate.before), _PHOTO_QUALITY),
         "plate": _webp(_encoded(background)),
         "background": plate.background is not None,
-        "room": room if len(basis.ratios) > len(basis.directions) else None,
+        "ambient": ambient if len(basis.ratios) > len(basis.directions) else None,
         "matte": _webp(np.round(plate.matte * 255).astype(np.uint8)),
         "exposure": _exposure(basis.samples),
         **packed_lights(plate.background is not None, plate.uniform_intensity),

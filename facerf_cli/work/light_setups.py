@@ -16,9 +16,9 @@ from facerf_cli.batch.inputs import (
 from facerf_cli.batch.recipe import RESULTS_VERSION, DigestOf, key_of, recipe_of
 from facerf_cli.errors import UsageError
 from facerf_cli.light.entries import (
+    AMBIENT_OVER_BRIGHT,
+    AMBIENT_OVER_DARK,
     MOST_FRAMES,
-    ROOM_BEFORE_BRIGHT,
-    ROOM_BEFORE_DARK,
     LitImage,
     Sampling,
     StudioLight,
@@ -28,7 +28,7 @@ from facerf_cli.light.entries import (
     numbers,
     sweep,
 )
-from facerf_cli.light.setups import ROOM, LightSetup
+from facerf_cli.light.setups import AMBIENT, LightSetup
 from facerf_cli.option import LIGHT, option
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.work.photo_options import LightOptions, fov_option
@@ -54,7 +54,7 @@ class LightSources:
         light_from: Photo to estimate the light from, as estimate-light does; or background, for the image
             behind the person. NAME=PHOTO joins its light with the named lights. Repeatable.
         fov_deg: Horizontal angle of view of an image without a face.
-        room: Ambient fill of lights: a fraction of their sum from all around, a map, or none.
+        ambient: Ambient fill: uniform light, as a fraction of the sum of the lights; a map; or none.
         rotate: Azimuth to add to the maps; or FROM:TO:N, which renders N frames up to, not including, TO.
         sampling: How maps become weights of lights: cell (integral over the light's cell), smooth (shared
             between neighbours), or paper (one pixel).
@@ -66,7 +66,7 @@ class LightSources:
         None, metavar="PHOTO|DIR", shown_default=False, panel=LIGHT, everyday=True
     )
     fov_deg: float | None = fov_option()
-    room: str | None = option(
+    ambient: str | None = option(
         None, metavar="FRACTION|MAP|none", shown_default="0.06; 0.03 over black", panel=LIGHT
     )
     rotate: str | None = option(None, metavar="DEG|FROM:TO:N", shown_default="as they are", panel=LIGHT)
@@ -192,29 +192,29 @@ def collect_setups(
     return tuple(setups)
 
 
-def in_room(setup: LightSetup, room: str | None, over_dark: bool) -> LightSetup:
-    """Add ambient fill to a setup's lights, by `--room` or by default.
+def set_ambient(setup: LightSetup, ambient: str | None, over_dark: bool) -> LightSetup:
+    """Add ambient fill to a setup's lights, by `--ambient` or by default.
 
-    Raises UsageError if `room` is not `none`, a fraction or a map, or if two lights would have its name.
+    Raises UsageError if `ambient` is not `none`, a fraction or a map, or if two lights would have its name.
     """
     if not setup.has_single:
         return setup
-    if room is None:
-        has_fill = ROOM in setup.names or any(light.is_uniform or light.original for light in setup.lights)
-        default = ROOM_BEFORE_DARK if over_dark else ROOM_BEFORE_BRIGHT
-        return replace(setup, room=0.0 if has_fill else default)
-    if room == "none":
+    if ambient is None:
+        has_fill = AMBIENT in setup.names or any(light.is_uniform or light.original for light in setup.lights)
+        default = AMBIENT_OVER_DARK if over_dark else AMBIENT_OVER_BRIGHT
+        return replace(setup, ambient=0.0 if has_fill else default)
+    if ambient == "none":
         return setup
-    if ROOM in setup.names:
-        raise UsageError(f"--room {room}: a light is also named {ROOM}; rename it, or remove --room")
-    if Path(room).suffix.lower() in (*MAP_SUFFIXES, ".json"):
-        light = StudioLight(envmap=Path(room))
-        names = (*setup.names, ROOM) if setup.names else ()
+    if AMBIENT in setup.names:
+        raise UsageError(f"--ambient {ambient}: a light has this name; rename the light, or remove --ambient")
+    if Path(ambient).suffix.lower() in (*MAP_SUFFIXES, ".json"):
+        light = StudioLight(envmap=Path(ambient))
+        names = (*setup.names, AMBIENT) if setup.names else ()
         return replace(setup, lights=(*setup.lights, light), names=names)
-    (fraction,) = numbers(room, ("FRACTION or MAP or none",), "--room")
+    (fraction,) = numbers(ambient, ("FRACTION or MAP or none",), "--ambient")
     if not 0 <= fraction <= 1:
-        raise UsageError(f"--room {room}: out of range; use 0 to 1, a map, or none")
-    return replace(setup, room=fraction)
+        raise UsageError(f"--ambient {ambient}: out of range; use 0 to 1, a map, or none")
+    return replace(setup, ambient=fraction)
 
 
 def drawn_maps(sources: LightSources, seed: int) -> tuple[DrawnMap, ...]:

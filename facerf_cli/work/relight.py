@@ -30,7 +30,7 @@ from facerf_cli.light.over_rig import (
     lights_over_stack,
     off_rig_deg,
     read_map,
-    with_room,
+    with_ambient,
 )
 from facerf_cli.light.setups import LightSetup
 from facerf_cli.person import Person, Target, fit
@@ -124,7 +124,7 @@ class Scene:
     @property
     def sums(self) -> list[int]:
         """Number of sums of lights per setup: all lights, then each named light."""
-        return [1 + (len(with_room(setup).names) if setup.names else 0) for setup in self.setups]
+        return [1 + (len(with_ambient(setup).names) if setup.names else 0) for setup in self.setups]
 
     def relit(self) -> Iterable[list[Any]]:
         """Return the subject under each setup, and under each of its named lights.
@@ -291,7 +291,9 @@ def _scene_of_stack(item: Item, plan: RelightPlan) -> Scene:
         facts = fit_facts(face_fit)
     return Scene(
         subject=StackImages(header, path, face),
-        setups=plan.setups if plan.has_room else tuple(replace(setup, room=0.0) for setup in plan.setups),
+        setups=plan.setups
+        if plan.has_ambient
+        else tuple(replace(setup, ambient=0.0) for setup in plan.setups),
         lights_of=partial(lights_over_stack, directions=directions, sampling=plan.sampling),
         metadata=attributes_of_sum(header.metadata, path.name, item.key),
         facts=facts,
@@ -401,10 +403,10 @@ def _write_images(
             if scene.identity is not None:
                 written[path]["identity_distance"] = scene.identity(image.pixels * np.float32(2.0**ev))
             del image
-        room = f", with {100 * setup.room:g} % ambient fill (--room)" if setup.room else ""
+        ambient = f", with {100 * setup.ambient:g} % ambient fill (--ambient)" if setup.ambient else ""
         if not shared_ev:
             name = setup.name + setup.frame
-            log.info("%s under %s: exposed by %+.2f EV%s", item.input_path, name, ev, room)
+            log.info("%s under %s: exposed by %+.2f EV%s", item.input_path, name, ev, ambient)
         del relit, each  # frees the maps before the next are made
     return written
 
@@ -433,7 +435,7 @@ def _rendered(
     The soft view keeps the look of photographed pixels and of the user's background. If the photo's original
     light is used, the view bends only what other lights add.
     """
-    subject, lit = scene.subject, with_room(setup)
+    subject, lit = scene.subject, with_ambient(setup)
     behind, wrap = scene.behind(setup, ev) if scene.behind else None, None
     if behind is not None and plan.options.light_wrap:
         wrap = LightWrap(behind, subject.matte, plan.options.light_wrap)

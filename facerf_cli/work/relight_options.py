@@ -33,8 +33,8 @@ from facerf_cli.work.light_setups import (
     collect_setups,
     drawn_maps,
     image_path,
-    in_room,
     photo_lights,
+    set_ambient,
 )
 from facerf_cli.work.output_options import Exposure, OutputOptions, parse_exposure
 from facerf_cli.work.photo_options import (
@@ -220,7 +220,7 @@ class RelightPlan:
         setups: The lights of each image; each recipe contains its own setup.
         sampling: How maps become weights of a rig's lights.
         cached: Maps in the user's cache that the setups use.
-        has_room: True if --room was given; without it, OLAT stacks get no ambient fill.
+        has_ambient: True if --ambient was given; without it, OLAT stacks get no ambient fill.
         shots: Videos and image sequences among the inputs.
         exposures: Exposures by setup of each take's middle frame, as far as this process knows them.
     """
@@ -229,7 +229,7 @@ class RelightPlan:
     setups: tuple[LightSetup, ...] = field(metadata=NOT_IN_RECIPE)
     sampling: Sampling
     cached: tuple[CachedMap, ...] = field(default=(), metadata=NOT_IN_RECIPE)
-    has_room: bool = field(default=False, metadata=NOT_IN_RECIPE)
+    has_ambient: bool = field(default=False, metadata=NOT_IN_RECIPE)
     shots: Shots = field(default_factory=Shots, metadata=NOT_IN_RECIPE)
     exposures: dict[Path, dict[str, float]] = field(
         default_factory=dict, metadata=NOT_IN_RECIPE, compare=False
@@ -350,10 +350,10 @@ def plan_relight(
     )
     return RelightPlan(
         filled,
-        tuple(in_room(setup, sources.room, face_only or dark(setup)) for setup in setups),
+        tuple(set_ambient(setup, sources.ambient, face_only or dark(setup)) for setup in setups),
         sources.sampling or ("smooth" if sweeps else "cell"),
         cached,
-        has_room=sources.room is not None,
+        has_ambient=sources.ambient is not None,
     )
 
 

@@ -36,10 +36,10 @@ def hazy(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("lights", [["key=40,25", "rim=-150,15"], ["key=40,25", "original"]])
 def test_the_wrap_is_a_layer_that_adds_up(given: Path, tmp_path: Path, hazy: Path, lights: list[str]) -> None:
     line = ["--background", hazy, *(part for light in lights for part in ("--light", light))]
-    path = relit(given, tmp_path / "wrapped", *line, "--light-wrap", "0.5", "--room", "0.1")
+    path = relit(given, tmp_path / "wrapped", *line, "--light-wrap", "0.5", "--ambient", "0.1")
     channels = exr_layers(path)
     names = {name.partition(".")[0] for name in channels} - {"R", "G", "B", "person"}
-    assert names == {"wrap", "room", *(light.partition(";")[0].partition("=")[0] for light in lights)}
+    assert names == {"wrap", "ambient", *(light.partition(";")[0].partition("=")[0] for light in lights)}
     layers = {name: np.stack([channels[f"{name}.{c}"] for c in "RGB"], -1) for name in names}
     matte = channels["person.A"]
     image, behind = read_image(path).pixels, covering(read_image(hazy).pixels, *matte.shape)

@@ -13,11 +13,11 @@ from facerf_cli.files.read import read_image
 from facerf_cli.image.colour import SOFT_VIEW, encode_display, linear_to_srgb, luminance
 from facerf_cli.light.entries import DELIGHT, ORIGINAL, LitImage, lit_images
 from facerf_cli.light.light import Light
-from facerf_cli.light.over_rig import lights_over_rig, with_room
+from facerf_cli.light.over_rig import lights_over_rig, with_ambient
 from facerf_cli.person import Target
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.white import WhiteBalance
-from facerf_cli.work.light_setups import LightSources, collect_setups, in_room
+from facerf_cli.work.light_setups import LightSources, collect_setups, set_ambient
 from tests import astronaut
 from tests.astronaut import PATH as PHOTO
 from tests.cli.lines import relight
@@ -48,9 +48,9 @@ def test_original_is_a_light_like_others_but_for_the_ambient_fill() -> None:
     assert image.names == ("key", "day") and image.frames[0][1].rgb == (1.0, 0.9, 0.8)
     assert not image_of("original=40,20").frames[0][0].original  # a light of that name
     (both,) = collect_setups(LightSources(light=["original", "key=40,20;stops=1"]), Path("out"))
-    assert in_room(both, None, False).room == 0
-    asked = with_room(in_room(both, "0.1", False))
-    assert asked.names == ("original", "key", "room")
+    assert set_ambient(both, None, False).ambient == 0
+    asked = with_ambient(set_ambient(both, "0.1", False))
+    assert asked.names == ("original", "key", "ambient")
     assert asked.lights[2].rgb == pytest.approx((0.2, 0.2, 0.2))
     (alone,) = collect_setups(LightSources(light=["original"]), Path("out"))
     assert not alone.has_single
@@ -140,7 +140,7 @@ def test_delight_is_a_uniform_light_of_that_name(entry: str) -> None:
 
 def test_its_brightness_is_that_of_each_person_and_it_gets_no_ambient_fill() -> None:
     (setup,) = collect_setups(LightSources(light=["delight;rgb=1,.5,.5", "key=40,20"]), Path("out"))
-    lit = with_room(in_room(setup.on_person(0, 3.0), None, False))
+    lit = with_ambient(set_ambient(setup.on_person(0, 3.0), None, False))
     assert [light.rgb for light in lit.lights] == [(3.0, 1.5, 1.5), (1.0, 1.0, 1.0)]
     assert lit.lights[0].is_uniform and not lit.lights[0].delight
 

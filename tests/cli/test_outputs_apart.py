@@ -34,7 +34,7 @@ READ = [
     ("relight me.png --envmap sky.exr -o {}", "sky.exr"),
     ("relight me.png --light key=40,20 --envmap fill=sky.exr -o {}", "sky.exr"),
     ("relight me.png --light map=sky.exr -o {}", "sky.exr"),
-    ("relight me.png --light 60,30 --room sky.exr -o {}", "sky.exr"),
+    ("relight me.png --light 60,30 --ambient sky.exr -o {}", "sky.exr"),
     ("relight me.png --light rig.toml -o {}", "rig.toml"),
     ("relight me.png --light 60,30 --lights rig.txt -o {}", "rig.txt"),
     ("relight me.png --light 60,30 --face-model model.npz -o {}", "model.npz"),

@@ -135,10 +135,10 @@ def test_lights_with_names_are_layers_that_add_up(given: Path, tmp_path: Path) -
         f"astronaut_{name}{suffix}" for name in ("light_5_6", "light_key+rim") for suffix in (".exr", ".png")
     ]
     path = tmp_path / "astronaut_light_key+rim.exr"
-    names = [f"{layer}{letter}" for letter in "RGB" for layer in ("", "key.", "rim.", "room.")]
+    names = [f"{layer}{letter}" for letter in "RGB" for layer in ("", "key.", "rim.", "ambient.")]
     layers = np.stack(layers_of(path, *names)).reshape(3, 4, 512, 512)
     np.testing.assert_allclose(layers[:, 1:].sum(1), layers[:, 0], rtol=5e-3, atol=2e-3)  # half floats
-    assert layers[:, 3].max() > 0.01  # of the room
+    assert layers[:, 3].max() > 0.01  # of the ambient fill
     assert layers[:, 1].max() > 0.1 and layers[2, 2].mean() > 1.5 * layers[0, 2].mean()
 
 
@@ -315,10 +315,11 @@ def test_near_lights_sweeps_and_rigs_from_the_command_line(given: Path, tmp_path
     ev = only_row(tmp_path / "out")["exposure_ev"]
     assert ev[f"astronaut_{names[0]}"] == ev[f"astronaut_{names[1]}"]
     layers = exr_layers(tmp_path / "out/astronaut_studio.exr")
-    red, green, blue, rim, room, whole, shadow, matte = (
-        layers[name] for name in ("key.R", "key.G", "key.B", "rim.R", "room.R", "R", "shadow.R", "person.A")
+    red, green, blue, rim, ambient, whole, shadow, matte = (
+        layers[name]
+        for name in ("key.R", "key.G", "key.B", "rim.R", "ambient.R", "R", "shadow.R", "person.A")
     )
-    np.testing.assert_allclose(red + rim + room, whole, rtol=5e-3, atol=2e-3)  # half floats
+    np.testing.assert_allclose(red + rim + ambient, whole, rtol=5e-3, atol=2e-3)  # half floats
     assert red.mean() > green.mean() > blue.mean() and 0.2 < shadow[matte > 0.9].mean() < 1
     left, right = (face_sides_of(tmp_path / f"out/astronaut_{name}.exr") for name in names[:2])
     assert left > 1.5 and right > 0  # lit from the image's left; the second frame from ahead
@@ -375,7 +376,7 @@ def test_a_stack_of_textures_is_refused_and_far_lights_are_not(
 
 
 def test_a_light_from_behind_leaves_the_face_dark(given: Path, tmp_path: Path) -> None:
-    lights = ["--light", "180,20", "--light", "180,20,4", "--room", "none"]
+    lights = ["--light", "180,20", "--light", "180,20,4", "--ambient", "none"]
     assert relight(given, tmp_path, *lights, "--format", "png") == 0
     row = only_row(tmp_path)
     assert list(row["exposure_ev"].values()) == [3.0, 1.0]  # four times the light, the same image

@@ -162,8 +162,8 @@ def test_every_method_relights_every_case(small: YaleB, monkeypatch: pytest.Monk
     np.testing.assert_allclose(centre, np.cos(np.radians(70)), atol=1e-3)
     one = Relighting("frontal", "frontal", "A-070E+00")
     monkeypatch.setattr(YaleSubject, "relightings", lambda self: iter([one]))
-    (in_room,) = compare_subject(replace(OPTIONS, room=0.5), bench, (small, "yaleB07"))
-    lighter = in_room.predictions["a"][110, 84]
+    (with_ambient,) = compare_subject(replace(OPTIONS, ambient=0.5), bench, (small, "yaleB07"))
+    lighter = with_ambient.predictions["a"][110, 84]
     np.testing.assert_allclose(lighter - centre, 0.5, atol=0.02)  # 48 lights stand for all around
 
 

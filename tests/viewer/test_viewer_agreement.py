@@ -28,7 +28,7 @@ from facerf_cli.image.strips import resized
 from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.light import Light, far_samples
-from facerf_cli.light.over_rig import lights_over_rig, with_room
+from facerf_cli.light.over_rig import lights_over_rig, with_ambient
 from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, rig_directions
 from facerf_cli.main import main
 from facerf_cli.person import Person
@@ -39,7 +39,7 @@ from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.relighting.relightable import RenderRequest
 from facerf_cli.viewer.page import packed, page
-from facerf_cli.work.light_setups import LightSources, collect_setups, in_room
+from facerf_cli.work.light_setups import LightSources, collect_setups, set_ambient
 from facerf_cli.work.view import head_place, of_photo, page_maps
 from tests.viewer.browser import Drawn, chromium, drawn, driven
 
@@ -57,10 +57,10 @@ class Shown:
     whole: PeopleInPhoto
     text: str
 
-    def relit(self, directions: torch.Tensor, weights: torch.Tensor, room: float = 0.06) -> Any:
-        """Under lights and what a room sends of them."""
+    def relit(self, directions: torch.Tensor, weights: torch.Tensor, ambient: float = 0.06) -> Any:
+        """Under lights and their ambient fill."""
         around, shares = far_samples(StudioLight())
-        sent = room * shares[:, None] * weights.sum(0)
+        sent = ambient * shares[:, None] * weights.sum(0)
         lights = Light(torch.cat([directions, around]), torch.cat([weights, sent])[None])
         return next(self.whole.relit(lights))
 
@@ -120,13 +120,15 @@ ORIGINAL_LIGHT = Light(torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, 1, 3), or
 PAIR = on_rig((75, 20), (-150, 10))
 COLOURED = f"light=a={text_of(PAIR[0])};rgb=1,0.5,0.25&light=b={text_of(PAIR[1])}&ev=-0.5"
 ALONE, MAP = COLOURED + "&background=none", "env=sun&rotate=50"
-BOTH = f"{MAP}&mapstops=-2&room=0.2&{COLOURED}"
+BOTH = f"{MAP}&mapstops=-2&ambient=0.2&{COLOURED}"
 SOFT = "light=key=40,25;kelvin=3200;size_deg=40&light=fill=left;stops=-2;rgb=0.5,0.7,1"
-PRESET = "light=key=loop;stops=-1&light=room=uniform;stops=-4"
-MAP_IN_ROOM = f"{MAP}&room=0.3"
+PRESET = "light=key=loop;stops=-1&light=ambient=uniform;stops=-4"
+MAP_WITH_AMBIENT = f"{MAP}&ambient=0.3"
 ORIGINAL, DIMMED = "light=original", "light=original;stops=-1&ev=1"  # as bright as the photo, both
 RIM = "light=original&light=rim=-150,15,2"
-ORIGINAL_IN_ROOM = f"light=name=day;from=original;stops=-1;kelvin=5000&light=40,25&{MAP}&room=0.2&ev=-0.5"
+ORIGINAL_WITH_AMBIENT = (
+    f"light=name=day;from=original;stops=-1;kelvin=5000&light=40,25&{MAP}&ambient=0.2&ev=-0.5"
+)
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +137,7 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Drawn]:
     chromium()
     addresses = [f"light={text_of(light)}" for light in RIG]
     addresses += [f"light={az},{el}&ev=1" for az, el in BETWEEN]
-    addresses += [COLOURED, ALONE, MAP, BOTH, SOFT, PRESET, MAP_IN_ROOM, RIM, ORIGINAL_IN_ROOM]
+    addresses += [COLOURED, ALONE, MAP, BOTH, SOFT, PRESET, MAP_WITH_AMBIENT, RIM, ORIGINAL_WITH_AMBIENT]
     addresses += [f"{ORIGINAL}{more}" for more in ("", "&background=none", "&env=sun")] + [DIMMED]
     found = drawn(shown().text, addresses, tmp_path_factory.mktemp("page"))
     return dict(zip(addresses, found, strict=True))
@@ -157,7 +159,7 @@ def test_lights_of_the_rig_and_between_agree_at_given_and_automatic_exposure(
         ev = min(shown().whole.exposure_ev(relit, "auto"), most_exposure_ev("auto", 1.24))
         assert abs(image.ev - ev) < 0.03
         assert_agrees(image.pixels, relit, image.ev)
-    assert image.ev == round(MOST_OVER_FRONT_EV - math.log2(1.24), 2)  # of the light from behind, and a room
+    assert image.ev == round(MOST_OVER_FRONT_EV - math.log2(1.24), 2)  # of the light behind and the fill
     errors = [
         shown().errors(
             images[f"light={az},{el}&ev=1"].pixels, shown().relit(towards((az, el)), torch.ones(1, 3)), 1.0
@@ -175,12 +177,12 @@ def test_lights_of_the_rig_and_between_agree_at_given_and_automatic_exposure(
     image = images[MAP]
     sun = next(one for one in page_maps() if one.name == "sun").pixels.astype(np.float32)
     rig = rig_directions()
-    relit = shown().relit(rig, envmap_weights(torch.from_numpy(sun), rig, rotate_deg=50), room=0)
+    relit = shown().relit(rig, envmap_weights(torch.from_numpy(sun), rig, rotate_deg=50), ambient=0)
     assert_agrees(image.pixels, relit, image.ev)
     assert abs(image.ev - shown().whole.exposure_ev(relit, "auto")) < 0.03
 
 
-@pytest.mark.parametrize("address", [BOTH, SOFT, PRESET, MAP_IN_ROOM, RIM, ORIGINAL_IN_ROOM])
+@pytest.mark.parametrize("address", [BOTH, SOFT, PRESET, MAP_WITH_AMBIENT, RIM, ORIGINAL_WITH_AMBIENT])
 def test_the_command_makes_the_same_image(
     address: str, images: dict[str, Drawn], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -188,19 +190,19 @@ def test_the_command_makes_the_same_image(
     *draw, line = images[address].command.splitlines()
     assert all(main(shlex.split(one)[1:]) == 0 for one in draw)
     words = shlex.split(line)
-    options = ("--light", "--room", "--envmap", "--rotate")
-    lights, rooms, maps, turns = (
+    options = ("--light", "--ambient", "--envmap", "--rotate")
+    lights, ambients, maps, turns = (
         [words[i + 1] for i, word in enumerate(words) if word == name] for name in options
     )
     sources = LightSources(light=lights, envmap=maps, rotate=next(iter(turns), None))
     (setup,) = collect_setups(sources, tmp_path / "out")
-    setup = with_room(in_room(setup, next(iter(rooms), None), False))
+    setup = with_ambient(set_ambient(setup, next(iter(ambients), None), False))
     relit = next(shown().whole.relit(lights_over_rig((setup,), "150", "cell")))
     pixels, ev = images[address].pixels, images[address].ev
     error = shown().errors(pixels, relit, ev)
     assert error.mean() < MEAN_BETWEEN and np.percentile(error, 95) < PERCENTILE_95
     if setup.has_original:
-        assert ("--exposure" in line) == ("ev=" in address) and bool(rooms) == ("room=" in address)
+        assert ("--exposure" in line) == ("ev=" in address) and bool(ambients) == ("ambient=" in address)
     elif "ev=" not in address:
         (strength,) = lights_over_rig((setup,), "150", "cell").strengths()
         truth = min(shown().whole.exposure_ev(relit, "auto"), most_exposure_ev("auto", strength))
@@ -227,7 +229,7 @@ def test_the_photo_s_own_light_alone_gives_the_photo(images: dict[str, Drawn]) -
 
 def test_without_webgl_a_smaller_image_follows_the_same_formulas(tmp_path: Path) -> None:
     chromium()
-    addresses = ["light=40,10&ev=0", "light=original;stops=1&light=40,10&room=0.06"]
+    addresses = ["light=40,10&ev=0", "light=original;stops=1&light=40,10&ambient=0.06"]
     relit = shown().relit(towards((40, 10)), torch.ones(1, 3))
     for image, factor in zip(
         drawn(shown().text, addresses, tmp_path, "--disable-3d-apis"), (0.0, 2.0), strict=True
@@ -269,7 +271,7 @@ _FIRST_LOOK = (
     for (let i = 0; i < 12; i++) seen.most = await click("add");
     const box = byId("view").getBoundingClientRect();
     seen.size = [box.width, box.height];
-    seen.room = document.querySelector("aside").getBoundingClientRect().left - box.right;
+    seen.gap = document.querySelector("aside").getBoundingClientRect().left - box.right;
     await drag(byId("marks"), [box.right - 1, box.top + box.height / 2]);
     seen.dragged = [Number(byId("azimuth").value), Number(byId("elevation").value)];
     for (let i = 0; i < 10; i++) seen.dark = await click("remove");
@@ -308,7 +310,7 @@ _BY_HAND = (
     seen.mirrored = await press("m");
     seen.marks = marks().map((one) => [one.ariaLabel, one.ariaPressed]);
     seen.uniform = await input("uniform", { checked: true });
-    seen.roomIsIdle = byId("room").disabled;
+    seen.ambientIsIdle = byId("ambient").disabled;
     seen.preset = await type("presets", "split");
     seen.exposure = await type("exposureTyped", "0.5");
     seen.originalIsIdle = byId("originalStops").disabled;
@@ -334,7 +336,7 @@ def test_a_page_begins_with_a_light_and_takes_nine(tmp_path: Path) -> None:
     lights = seen["most"].split("'")[1].split(";")
     assert len(lights) == 9 == len(set(lights))  # none on another
     width, height = seen["size"]
-    assert seen["room"] >= 0 and abs(width - height) < 1  # square, and not over the panel
+    assert seen["gap"] >= 0 and abs(width - height) < 1  # square, and not over the panel
     azimuth, elevation = seen["dragged"]
     assert azimuth > 60 and abs(elevation) < 40  # the picture's right side
     assert seen["dark"].startswith("# add a light")
@@ -370,7 +372,7 @@ def test_lights_are_moved_by_hand_and_by_numbers(tmp_path: Path) -> None:
         [f"Light 1, key: azimuth 39, elevation {moved[1]:g} degrees", "true"],
         ["Light 2: azimuth 60, elevation 10 degrees", "false"],
     ]
-    assert "name=key;from=uniform;kelvin=3200;stops=-1.25'" in seen["uniform"] and seen["roomIsIdle"]
+    assert "name=key;from=uniform;kelvin=3200;stops=-1.25'" in seen["uniform"] and seen["ambientIsIdle"]
     assert "--light 'name=key;from=82.15,9.69;size_deg=11.54'" in seen["preset"]
     assert "--exposure 0.5 " in seen["exposure"]
     assert seen["originalIsIdle"] and seen["original"].endswith(" --light original -o out")

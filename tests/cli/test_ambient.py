@@ -1,4 +1,4 @@
-"""The light of a room that comes with lights by default, and maps that shine together with lights."""
+"""Ambient fill, which lights have by default, and maps that share an image with lights."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,10 +13,10 @@ from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.image.strips import resized
 from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.light import Light
-from facerf_cli.light.over_rig import as_lit, lights_over_rig, with_room
+from facerf_cli.light.over_rig import as_lit, lights_over_rig, with_ambient
 from facerf_cli.light.setups import LightSetup
 from facerf_cli.main import main
-from facerf_cli.work.light_setups import LightSources, collect_setups, in_room
+from facerf_cli.work.light_setups import LightSources, collect_setups, set_ambient
 from facerf_cli.work.relight_options import parse_background
 from tests.astronaut import PATH as PHOTO
 from tests.cli.lines import relight
@@ -41,13 +41,13 @@ def setups_of(
 
 
 def lights_of(*setups: LightSetup) -> Light:
-    return lights_over_rig(tuple(with_room(setup) for setup in setups), "150", "cell")
+    return lights_over_rig(tuple(with_ambient(setup) for setup in setups), "150", "cell")
 
 
 def test_a_named_light_is_one_of_the_sums_that_it_shines_in() -> None:
     (setup,) = setups_of([KEY, RIM])
-    found = lights_over_rig(as_lit((replace(setup, room=0.1),), 0), "150", "cell")
-    assert len(found.weights) == 4 and len(found.directions) == 2 + 24  # of the room
+    found = lights_over_rig(as_lit((replace(setup, ambient=0.1),), 0), "150", "cell")
+    assert len(found.weights) == 4 and len(found.directions) == 2 + 24  # of the ambient fill
     torch.testing.assert_close(found.weights[0], found.weights[1:].sum(0))
 
 
@@ -65,33 +65,33 @@ def test_a_named_light_is_one_of_the_sums_that_it_shines_in() -> None:
 )
 def test_the_default_share_follows_the_background(background: str, share: float) -> None:
     (setup,) = setups_of([KEY])
-    assert in_room(setup, None, parse_background(background).is_dark(setup)).room == share
+    assert set_ambient(setup, None, parse_background(background).is_dark(setup)).ambient == share
 
 
-def test_a_map_has_no_room_and_a_light_of_a_room_turns_the_default_off(sky: Path) -> None:
+def test_a_map_has_no_ambient_fill_and_a_light_of_that_name_replaces_it(sky: Path) -> None:
     (mapped,) = setups_of([], [str(sky)])
-    assert in_room(mapped, None, False) == in_room(mapped, "0.5", False) == mapped
-    for entry in ("name=fill;from=uniform", "room=90,0"):
+    assert set_ambient(mapped, None, False) == set_ambient(mapped, "0.5", False) == mapped
+    for entry in ("name=fill;from=uniform", "ambient=90,0"):
         (setup,) = setups_of([KEY, entry])
-        assert in_room(setup, None, False) == setup
-    refused(UsageError, "--room 0.1: a light is also named room", in_room, setup, "0.1", False)
+        assert set_ambient(setup, None, False) == setup
+    refused(UsageError, "--ambient 0.1: a light has this name", set_ambient, setup, "0.1", False)
 
 
-def test_none_leaves_the_lights_and_a_rooms_light_is_a_share_of_their_sum() -> None:
+def test_none_leaves_the_lights_and_ambient_fill_is_a_fraction_of_their_sum() -> None:
     (setup,) = setups_of([KEY, RIM])
-    assert in_room(setup, "none", False) == setup == with_room(setup)
-    assert in_room(setup, "0", False) == setup
+    assert set_ambient(setup, "none", False) == setup == with_ambient(setup)
+    assert set_ambient(setup, "0", False) == setup
     red, near = "name=a;from=90,0;rgb=1,0,0", "name=b;at=0,0,1;rgb=0,2,0;stops=1"
     (setup,) = setups_of([red, near])
-    lit = with_room(in_room(setup, "0.1", False))
-    assert lit.names == ("a", "b", "room") and lit.lights[:2] == setup.lights
+    lit = with_ambient(set_ambient(setup, "0.1", False))
+    assert lit.names == ("a", "b", "ambient") and lit.lights[:2] == setup.lights
     assert lit.lights[2] == StudioLight(rgb=pytest.approx((0.1, 0.4, 0.0)))
 
 
 def test_stacked_images_stay_sums(sky: Path) -> None:
     """Of lights by themselves, and of a map with them: weights of all that shines add up."""
     key, rim, together, alone = (
-        in_room(setup, None, False)
+        set_ambient(setup, None, False)
         for setup in (
             *setups_of([KEY]),
             *setups_of([RIM]),
@@ -115,23 +115,23 @@ def test_a_map_with_a_name_turns_in_every_frame_and_has_an_intensity(sky: Path) 
     torch.testing.assert_close(2 * weights[0], weights[1])
 
 
-def test_maps_of_rig_files_and_rooms(sky: Path) -> None:
+def test_maps_of_rig_files_and_of_the_ambient_fill(sky: Path) -> None:
     rig = sky.with_name("studio.toml")
     rig.write_text("[sky]\nmap = 'sky.exr'\nstops = -1\n[key]\nfrom = [40, 20]\n")
     (setup,) = setups_of([str(rig)])
     assert setup.lights[0] == StudioLight(envmap=sky, stops=-1.0) and setup.names == ("sky", "key")
     (setup,) = setups_of([KEY])
-    lit = in_room(setup, str(sky), False)
-    assert lit.names == ("key", "room") and lit.lights[1] == StudioLight(envmap=sky)
+    lit = set_ambient(setup, str(sky), False)
+    assert lit.names == ("key", "ambient") and lit.lights[1] == StudioLight(envmap=sky)
 
 
-def test_the_line_says_which_room_was_taken_and_a_stack_has_none(
+def test_the_ambient_fill_is_logged_and_a_stack_has_none(
     given: Path, stack: Path, tmp_path: Path, capsys: Said
 ) -> None:
     line = ["--light", "70,0", "--composite", "face"]
     assert relight(given, tmp_path / "a", *line) == 0
-    assert "3 % ambient fill (--room)" in capsys.readouterr().err
-    for name, more in (("default", []), ("none", ["--room", "none"]), ("wide", ["--room", "0.5"])):
+    assert "3 % ambient fill (--ambient)" in capsys.readouterr().err
+    for name, more in (("default", []), ("none", ["--ambient", "none"]), ("wide", ["--ambient", "0.5"])):
         assert relight(given, tmp_path / name, "--light", "70,0", *more, photo=stack) == 0
     assert capsys.readouterr().err.count("ambient fill") == 1
     images = {
@@ -149,7 +149,7 @@ def test_each_person_of_a_group_has_lights_of_its_own(given: Path, tmp_path: Pat
         tmp_path / "two.png", np.concatenate([np.pad(small, ((0, 75), (0, 0), (0, 0)), "edge"), large], 1)
     )
     red, green = "name=a;from=20,10;rgb=1,0,0;face=0", "name=b;from=-20,10;rgb=0,1,0;face=1"
-    line = ["--reflectance", "field", "--room", "none", "--background", "0,0,0", "--format", "exr"]
+    line = ["--reflectance", "field", "--ambient", "none", "--background", "0,0,0", "--format", "exr"]
     checkpoint = ["--checkpoint", str(given / "lambert.safetensors")]
     photo = [*checkpoint, "relight", str(tmp_path / "two.png"), "--light", red, "--light", green, *line]
     assert main([*photo, "--face", "all", "-o", str(tmp_path / "out")]) == 0
