@@ -90,7 +90,9 @@ def measured(
     wall = MEAN_RADIANCE / 2 * (1 - view.portrait.alpha)
     gain = GAIN / float(natural[0].sum(0).mean())
     photo = (gain * source + wall).permute(1, 2, 0).clamp(0, 1).numpy()
-    person = fit(models, photo, white=None, face=find_faces(models.networks.people, photo, "the photo")[0])
+    person = fit(
+        models, photo, white_balance=None, face=find_faces(models.networks.people, photo, "the photo")[0]
+    )
     composition = person.prepare(Target(background="none"))
     shown = {}
     lit = composition.relit(Light(rig, torch.cat([lamp, natural[1:]])))

@@ -40,7 +40,7 @@ def main() -> None:
             person = fit(
                 models,
                 photo,
-                white=None,
+                white_balance=None,
                 face=find_faces(models.networks.people, photo, source)[0],
             )
         except FacerfError as error:

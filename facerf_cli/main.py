@@ -71,6 +71,7 @@ _REMOVED = {
     "--matte-from": "write mattes with `rembg p photos mattes`, and pass --person mattes",
     "--photo": "relight the photo itself, without its stack",
     "--room": "use --ambient",
+    "--white": "use --white-balance",
 }
 _SPINS = "20000"  # OpenMP spin count: idle threads sleep sooner and leave the cores to other programs
 _AMERICAN = re.compile(r"^(--(?:in|out)put-)colorspace(?=$|=)")

@@ -43,7 +43,7 @@ from facerf_cli.portrait.parse import CLASSES
 from facerf_cli.portrait.person import unit_normals
 from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.raster.camera import Camera, pose_to_rotation, rays_of_rows
-from facerf_cli.relighting import White
+from facerf_cli.relighting import BalanceMode
 from facerf_cli.relighting.face_alone import FACE_LAYERS, FaceAlone, FaceInPhoto
 from facerf_cli.relighting.field import Field
 from facerf_cli.relighting.fitting import head_of, reflectance_of
@@ -88,7 +88,7 @@ def fit(
     network_alone: bool = False,
     matte: Any = None,
     texture_side: int | None = None,
-    white: White | None = "photo",
+    white_balance: BalanceMode | None = "keep",
     face: Face | None = None,
     head: Head | None = None,
     steady: SmoothedFrame | None = None,
@@ -109,8 +109,8 @@ def fit(
         network_alone: Omit the ratio image, which makes the photo's original light reproduce the photo.
         matte: Your own alpha [H, W] of the person, 0 to 1, instead of the networks' matte.
         texture_side: Side of the face's texture in texels. Default: the side used in training.
-        white: White balance of skin under white light: "photo" keeps the photo's colours, "scene" removes the
-            colour of strongly coloured light, None keeps the networks' colours.
+        white_balance: Skin under white light: "keep" keeps the photo's colours, "neutral" removes the colour
+            of strongly coloured light, None keeps the networks' colours.
         face: One of `find_faces`, instead of the largest face.
         head: A head that was fitted before; nothing is fitted.
         steady: Temporally smoothed inputs for a frame of a video (`relighting/shot.py`).
@@ -124,8 +124,8 @@ def fit(
         UsageError: Two arguments exclude each other.
     """
     one_of(RelightKind, "reflectance", reflectance)
-    if white is not None:
-        one_of(White, "white", white)
+    if white_balance is not None:
+        one_of(BalanceMode, "white_balance", white_balance)
     if geometry is not None:
         one_of(Geometry, "geometry", geometry)
     if texture_side is not None and not 16 <= texture_side <= LARGEST_TEXTURE:
@@ -149,7 +149,9 @@ def fit(
         elif face is None:
             (face,) = find_faces(models, pixels, "largest")
         head = head_of(models, pixels, face, geometry, models.sides(texture_side), matte)
-    field = reflectance_of(models, head, reflectance, network_alone, pixels, steady, matte, white, normals)
+    field = reflectance_of(
+        models, head, reflectance, network_alone, pixels, steady, matte, white_balance, normals
+    )
     return Person(models, pixels, head, field, matte, reflectance, isinstance(photo, Tensor))
 
 
@@ -272,7 +274,8 @@ class Person:
         """
         kind = "field" if self.kind == "portrait" else self.kind
         with torch.no_grad():
-            light = estimate_light(self.models, self.head, kind, rig_directions(lights), white="scene").light
+            rig = rig_directions(lights)
+            light = estimate_light(self.models, self.head, kind, rig, white_balance="neutral").light
         return Light(light.directions.numpy(), light.weights.numpy())
 
     def backdrop(self, envmap: Array, rotate_deg: float = 0.0, blur: float = 0.0) -> Array:

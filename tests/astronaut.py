@@ -34,7 +34,7 @@ def face() -> Face:
 @cache
 def person() -> Person:
     """The astronaut with her portrait field."""
-    return fit(models(), photo(), face=face(), texture_side=TEXTURE, white=None)
+    return fit(models(), photo(), face=face(), texture_side=TEXTURE, white_balance=None)
 
 
 def head() -> Head:

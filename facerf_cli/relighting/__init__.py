@@ -1,3 +1,3 @@
 from typing import Literal
 
-White = Literal["photo", "scene"]  # of skin under even white light: as in the photo, or without its light
+BalanceMode = Literal["keep", "neutral"]  # the photo's white balance, or coloured light neutralised

@@ -20,7 +20,7 @@ from facerf_cli.network.inputs import is_grey, mixed_precision, without_cast
 from facerf_cli.network.reflectance import ReflectanceNetwork
 from facerf_cli.portrait.correction import Quotient
 from facerf_cli.raster.texture import bake_attributes
-from facerf_cli.relighting import White
+from facerf_cli.relighting import BalanceMode
 from facerf_cli.relighting.detail import NOISE, contrast, lost_detail
 from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.white import WhiteBalance, without_colour_of_shade
@@ -161,12 +161,12 @@ def shrunk(face: FaceTexture) -> FaceTexture:
     return FaceTexture(small[:3], small[3], F.normalize(small[4:], dim=0))
 
 
-def balance_of(white: White, pairs: Iterable[tuple[FaceTexture, Tensor]]) -> WhiteBalance:
+def balance_of(mode: BalanceMode, pairs: Iterable[tuple[FaceTexture, Tensor]]) -> WhiteBalance:
     """Return the white balance of a face from its textures, each with the small face under uniform light."""
     faces, uniform = zip(*((shrunk(face), relit) for face, relit in pairs), strict=True)
     skin = torch.stack([face.visible > SEEN_WELL for face in faces]) * region_mask("skin", _LIGHT_SIDE)
     photos = torch.stack([face.texture for face in faces], 1)
-    return WhiteBalance.of(white, torch.stack(uniform, 1), photos, skin)
+    return WhiteBalance.of(mode, torch.stack(uniform, 1), photos, skin)
 
 
 def weighted_sum(batches: Iterable[Tensor], weights: Tensor) -> Tensor:

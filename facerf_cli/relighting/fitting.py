@@ -25,7 +25,7 @@ from facerf_cli.portrait.person import (
     wider_square,
     with_normals,
 )
-from facerf_cli.relighting import White
+from facerf_cli.relighting import BalanceMode
 from facerf_cli.relighting.field import Field, balance_of
 from facerf_cli.relighting.models import Models, Sides
 from facerf_cli.relighting.photo_light import SourceLight, source_light
@@ -111,7 +111,7 @@ def reflectance_of(
     photo: np.ndarray | None = None,
     steady: SmoothedFrame | None = None,
     matte: np.ndarray | None = None,
-    white: White | None = None,
+    white_balance: BalanceMode | None = None,
     normals: np.ndarray | None = None,
 ) -> Reflectance:
     """Predict the reflectance of a head; see `facerf.fit` for the arguments.
@@ -129,10 +129,10 @@ def reflectance_of(
         quotient = source.quotient if source else None
         field = Field(models, head.face, quotient, remove_shade_colour=source is not None)
         field = field.with_detail(source.uniform) if source else field
-        if steady or white is None:
+        if steady or white_balance is None:
             return source, replace(field, balance=steady.balance if steady else None)
         uniform = source.uniform if source else field.small_under_uniform_light()
-        return source, replace(field, balance=balance_of(white, [(head.face, uniform)]))
+        return source, replace(field, balance=balance_of(white_balance, [(head.face, uniform)]))
 
     def views_of_person() -> list[SeenPerson]:
         assert photo is not None

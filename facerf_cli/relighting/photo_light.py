@@ -30,7 +30,7 @@ from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.network.features import FeatureNetwork
 from facerf_cli.network.inputs import exposure_of, resize
 from facerf_cli.portrait.correction import Quotient
-from facerf_cli.relighting import White
+from facerf_cli.relighting import BalanceMode
 from facerf_cli.relighting.field import SEEN_WELL, Field, balance_of, photo_evidence, shrunk, weighted_sum
 from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.white import without_baked_in
@@ -193,7 +193,7 @@ def estimate_light(
     estimator: Estimator = DEFAULT_ESTIMATOR,
     keep_eyes: bool = False,
     more: Sequence[Head] = (),
-    white: White | None = None,
+    white_balance: BalanceMode | None = None,
 ) -> LightEstimate:
     """Estimate the light of a head's photo over a rig (paper, 'Light Estimation', Eq. leastsq).
 
@@ -207,7 +207,7 @@ def estimate_light(
         estimator: How the least squares are solved and refined.
         keep_eyes: Whether to use the eyes, which the paper leaves out.
         more: Heads in other frames of a shot, used together.
-        white: White balance of the skin that the light falls on (`white.py`).
+        white_balance: White balance of the skin that the light falls on (`white.py`).
 
     Raises:
         InputError: Too little of the face is visible.
@@ -236,11 +236,11 @@ def estimate_light(
 
     def balanced(weights: Tensor) -> RigLight:
         """Return the light of weights [L, 3] that falls on white-balanced skin."""
-        if white is None:
+        if white_balance is None:
             return RigLight(rig, weights)
         quotient = Quotient.of(evidence.photo, evidence.relit(weights), shrunk(head.face).visible)
         uniform = quotient.corrected(evidence.olats).mean(0)
-        return RigLight(rig, weights / balance_of(white, [(head.face, uniform)]).gain)
+        return RigLight(rig, weights / balance_of(white_balance, [(head.face, uniform)]).gain)
 
     if features is None:
         return LightEstimate(balanced(weights), evidence, evidence.relit(weights), key_share=key_share)

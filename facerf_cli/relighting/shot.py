@@ -32,7 +32,7 @@ from facerf_cli.portrait.segment import (
     small_image,
     within_matte,
 )
-from facerf_cli.relighting import White
+from facerf_cli.relighting import BalanceMode
 from facerf_cli.relighting.field import balance_of
 from facerf_cli.relighting.models import Models, Sides
 from facerf_cli.relighting.photo_light import light_of_frames, source_light
@@ -135,10 +135,10 @@ class SteadyShot:
         sightings: Sequence[Sighting | None],
         sides: Sides,
         mattes: Callable[[int], np.ndarray] | None = None,
-        white: White | None = None,
+        white_balance: BalanceMode | None = None,
     ) -> None:
         self._models, self._frames, self._mattes = models, frames, mattes
-        self._sides, self._white = sides, white
+        self._sides, self._white_balance = sides, white_balance
         self._path = path_of(sightings)  # [N, 68, 2], NaN where the face is lost
         self._sighted = [frame for frame, sighting in enumerate(sightings) if sighting]
         self._tracked = frozenset(np.flatnonzero(np.isfinite(self._path).all((1, 2))).tolist())
@@ -187,11 +187,11 @@ class SteadyShot:
 
     @cached_property
     def _balance(self) -> WhiteBalance | None:
-        if self._white is None:
+        if self._white_balance is None:
             return None
         faces = [head.face for head in self._key_heads.values()]
         uniform = [source_light(self._models, one, self.light).uniform for one in faces]
-        return balance_of(self._white, list(zip(faces, uniform, strict=True)))
+        return balance_of(self._white_balance, list(zip(faces, uniform, strict=True)))
 
     @cached_property
     def _key_heads(self) -> dict[int, Head]:

@@ -2,10 +2,10 @@
 
 A photo shows only the product of light colour and skin colour, and networks attribute too much of it to the
 light: under white light, skin turns ashen. But a camera has already balanced white. So under uniform white
-light skin gets the chromaticity of the photo (`photo`). In a photo that is far from white, such as one taken
-under sodium light, the estimated colour is removed (`scene`), but only until skin has a colour that skin can
-have. The gains are the same for all lights. Hair and cloth have their own gains, for the same light, because
-networks keep more of their colour (`WhiteBalance`).
+light skin gets the chromaticity of the photo (`keep`). In a photo that is far from white, such as one taken
+under sodium light, the estimated colour is removed (`neutral`), but only until skin has a colour that skin
+can have. The gains are the same for all lights. Hair and cloth have their own gains, for the same light,
+because networks keep more of their colour (`WhiteBalance`).
 
 Where a photo's key light does not reach, skin is lit by other light: blue sky, a purple wall. Networks
 attribute some of that colour to the skin, and under a new key light it shows as a stain. Therefore networks
@@ -31,7 +31,7 @@ from facerf_cli.light.estimate import clipped
 from facerf_cli.network.inputs import is_grey
 from facerf_cli.portrait.parse import CLASSES, class_index
 from facerf_cli.raster.texture import blurred, blurred_within, smoothstep
-from facerf_cli.relighting import White
+from facerf_cli.relighting import BalanceMode
 
 SURE = 0.9  # coverage of a class above which a pixel counts
 _BLACK = 0.15  # fraction of the class's median brightness below which chromaticity is ignored
@@ -64,29 +64,29 @@ class WhiteBalance:
     light: Tensor  # log chromaticity [2] of the light that is removed from the photo
     uniform_scale: float  # intensity of uniform light that reproduces the skin's brightness in the photo
     off_white: float = 0.0  # log chromaticity between the photo's skin and the nearest skin; mostly about 0
-    white: White = "photo"
+    mode: BalanceMode = "keep"
 
     @staticmethod
-    def of(white: White, relit: Tensor, photo: Tensor, skin: Tensor) -> "WhiteBalance":
+    def of(mode: BalanceMode, relit: Tensor, photo: Tensor, skin: Tensor) -> "WhiteBalance":
         """Return the white balance of a face from its photo [3, ...], scene-linear.
 
         `relit` [3, ...] is the face under uniform white light of radiance 1 / 4: the radiance that a surface
         without any occluder receives. `skin` [...] is the coverage of skin. Grey photos, and those where
         little skin has a chromaticity, are not changed.
         """
-        chromas = _chromas(relit, photo, skin, white)
+        chromas = _chromas(relit, photo, skin, mode)
         sums = [float(luminance((one * skin).flatten(1).sum(1).numpy())) for one in (photo, relit)]
         uniform_scale = sums[0] / max(4 * sums[1], 1e-6)
         if chromas is None:
-            return WhiteBalance(torch.ones(3), torch.zeros(2), uniform_scale, white=white)
+            return WhiteBalance(torch.ones(3), torch.zeros(2), uniform_scale, mode=mode)
         of_relit, of_photo = chromas
         nearest = _nearest_skin(of_photo)
         off_white = float((of_photo - nearest).norm())
         wanted = of_photo
-        if white == "scene":
+        if mode == "neutral":
             weight = smoothstep(torch.tensor((off_white - _BALANCED) / (_FAR - _BALANCED)))
             wanted = torch.lerp(nearest, _nearest_skin(of_relit), weight)
-        return WhiteBalance(_gain(of_relit, wanted), of_photo - wanted, uniform_scale, off_white, white)
+        return WhiteBalance(_gain(of_relit, wanted), of_photo - wanted, uniform_scale, off_white, mode)
 
     @property
     def is_strongly_coloured(self) -> bool:
@@ -101,14 +101,16 @@ class WhiteBalance:
         """
         gains = torch.ones(len(CLASSES), 3)
         for group in _GROUPS:
-            chromas = _chromas(relit, photo, classes[group].sum(0), self.white)
+            chromas = _chromas(relit, photo, classes[group].sum(0), self.mode)
             if chromas is not None:
                 gains[group] = _gain(chromas[0], chromas[1] - self.light)
         person = classes[1:].sum(0).clamp_min(1e-6)
         return 1 + torch.einsum("k...,kc->c...", classes[1:] / person, gains[1:] - 1)
 
 
-def _chromas(relit: Tensor, photo: Tensor, coverage: Tensor, white: White) -> tuple[Tensor, Tensor] | None:
+def _chromas(
+    relit: Tensor, photo: Tensor, coverage: Tensor, mode: BalanceMode
+) -> tuple[Tensor, Tensor] | None:
     """Return the median log chromaticities [2] of a class, relit and in the photo; None if it has none."""
     sure = coverage > SURE
     sure &= ~clipped(photo, sure).any(0)
@@ -116,7 +118,7 @@ def _chromas(relit: Tensor, photo: Tensor, coverage: Tensor, white: White) -> tu
     sure &= brightness > _BLACK * brightness[sure].median()
     if sure.sum() < _LEAST or is_grey(photo):
         return None
-    if white == "scene":
+    if mode == "neutral":
         sure &= brightness >= torch.quantile(brightness[sure], _BY_KEY)
     return _chroma(relit[:, sure]), _chroma(photo[:, sure])
 

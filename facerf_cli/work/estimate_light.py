@@ -121,7 +121,7 @@ def _write_estimate(
             Estimator(options.non_negative, features),
             options.keep_eyes,
             other_heads,
-            white="scene",
+            white_balance="neutral",
         )
     residual = estimate.evidence.residual(estimate.explained)
     if residual > _UNEXPLAINED:

@@ -14,7 +14,7 @@ from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import UsageError
 from facerf_cli.light.entries import numbers, parse_lights
 from facerf_cli.option import FACE, IMAGE, LIGHT, METHOD, flag, option
-from facerf_cli.relighting import White
+from facerf_cli.relighting import BalanceMode
 
 MOST_ESTIMATED = 1024  # lights; above it the non-negative least squares take minutes
 _TEXTURE_STEP, _TEXTURE_MOST = 256, 2048
@@ -58,12 +58,12 @@ class PortraitOptions:
     """How the portrait field of a photo's person is made.
 
     Attributes:
-        white: White balance: photo (as in the photo), or scene (neutralise coloured light, such as sodium
-            lamps).
+        white_balance: White balance: keep (as in the photo), or neutral (removes the colour of coloured
+            light, such as sodium lamps).
         normals_from: Normals from another method (.npy, .exr, .png).
     """
 
-    white: White = option("photo", panel=IMAGE)
+    white_balance: BalanceMode = option("keep", panel=IMAGE)
     normals_from: Path | None = option(None, metavar=COMPANION, shown_default=False, panel=METHOD)
 
 

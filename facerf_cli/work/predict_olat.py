@@ -81,7 +81,7 @@ def _of_person(
     require_face(models.face, head.fit, size_px)
     alpha, matte = (None if part is None else resized(part, *size_px) for part in (image.alpha, face.matte))
     normals = read_normals(item, work.normals_from, size_px)
-    choices: dict[str, Any] = {"network_alone": work.network_alone, "white": work.white}
+    choices: dict[str, Any] = {"network_alone": work.network_alone, "white_balance": work.white_balance}
     with naming(item.input_path):
         person = fit(models, photo, matte=matte, head=head, normals=normals, **choices)
     subject = person.prepare(Target(alpha=alpha, background="none"))
@@ -124,7 +124,9 @@ def _of_face(
         seen = large[1]
 
     def olats() -> Iterator[Tensor]:
-        field = reflectance_of(models, face.head, "field", work.network_alone, white=work.white)
+        field = reflectance_of(
+            models, face.head, "field", work.network_alone, white_balance=work.white_balance
+        )
         assert isinstance(field, Field)
         turn = None if rotation is None else face.fit.turn_to(rotation)
         for textures in replace(field, bf16=work.precision == "bf16").olats(directions, turn):

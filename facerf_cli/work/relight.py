@@ -260,7 +260,7 @@ def _scene_of_stack(item: Item, plan: RelightPlan) -> Scene:
         "--pose": options.pose is not None,
         "--background": options.background.kind not in ("photo", "none"),
         "--reflectance": options.reflectance not in ("field", "portrait"),
-        "--white": options.white != "photo",
+        "--white-balance": options.white_balance != "keep",
         "--network-alone": options.network_alone,
         "--normals-from": options.normals_from is not None,
         "--person": plan.photo.person is not None,
@@ -312,7 +312,7 @@ def _fitted(plan: RelightPlan, read: _Read, face: PhotoFace) -> tuple[FittedFace
             network_alone=options.network_alone,
             matte=read.matte,
             texture_side=plan.photo.texture_side,
-            white=options.white,
+            white_balance=options.white_balance,
             face=face.found,
             head=of_shot.head if of_shot else None,
             steady=of_shot.steady if of_shot else None,
@@ -321,8 +321,8 @@ def _fitted(plan: RelightPlan, read: _Read, face: PhotoFace) -> tuple[FittedFace
     if of_shot:
         return of_shot, person
     fitted = fitted_face(face, person.head, read.matte)
-    if person.balance is not None and person.balance.is_strongly_coloured and options.white == "photo":
-        log.info("%s: its light is strongly coloured (--white scene neutralises it)", face.name)
+    if person.balance is not None and person.balance.is_strongly_coloured and options.white_balance == "keep":
+        log.info("%s: its light is strongly coloured (--white-balance neutral removes its colour)", face.name)
     fitted.see(person.segmentation)
     return fitted, person
 
@@ -373,7 +373,7 @@ def _in_shot(item: Item, plan: RelightPlan) -> Any:
         return None
     from facerf_cli.work.sequence import open_at
 
-    return open_at(plan.shots, item, plan.photo, plan.options.white)
+    return open_at(plan.shots, item, plan.photo, plan.options.white_balance)
 
 
 def _write_images(

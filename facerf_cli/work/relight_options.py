@@ -372,7 +372,7 @@ def _rules(options: RelightOptions, setups: Sequence[LightSetup]) -> dict[str, b
             options.pose is not None and options.composite == "photo"
         ),
         f"--network-alone: {of_field}": options.network_alone and baseline,
-        f"--white: {of_field}": options.white != "photo" and baseline,
+        f"--white-balance: {of_field}": options.white_balance != "keep" and baseline,
         f"--light {word}: {of_field}": bool(by_photo) and baseline,
         f"--background: {of_whole}": options.background.kind != "photo" and not whole,
         f"--light {ORIGINAL}: {of_whole}": any(setup.has_original for setup in setups) and not whole,

@@ -18,7 +18,7 @@ from facerf_cli.files.video import Video
 from facerf_cli.image.colour import SRGB, named_space, to_display, to_linear_rec709, unit_floats
 from facerf_cli.portrait.find import face_at, face_with
 from facerf_cli.portrait.segment import Segmentation
-from facerf_cli.relighting import White
+from facerf_cli.relighting import BalanceMode
 from facerf_cli.relighting.models import described_file
 from facerf_cli.relighting.shot import SteadyShot
 from facerf_cli.relighting.shot_track import ShotTrack
@@ -155,9 +155,9 @@ class OpenShot:
     Each take is smoothed on its own, as if other takes did not show the face, so nothing crosses a cut.
     """
 
-    def __init__(self, shot: Shot, options: PhotoOptions, white: White | None = None) -> None:
+    def __init__(self, shot: Shot, options: PhotoOptions, white_balance: BalanceMode | None = None) -> None:
         self.shot, self.track, self.frames = shot, ShotTrack.read(shot.track), ShotFrames(shot, options)
-        self._options, self._white = options, white
+        self._options, self._white_balance = options, white_balance
         self._take = range(0)
         self._steady: SteadyShot | None = None
 
@@ -171,7 +171,9 @@ class OpenShot:
             ]
             mattes = self._matte_in_take if options.person else None
             sides = models.sides(options.texture_side)
-            self._steady = SteadyShot(models, self.frames.pixels, sightings, sides, mattes, self._white)
+            self._steady = SteadyShot(
+                models, self.frames.pixels, sightings, sides, mattes, self._white_balance
+            )
         return self._steady
 
     def _user_matte(self, number: int) -> np.ndarray | None:
@@ -218,12 +220,12 @@ class OpenShot:
 
 
 def open_at(
-    shots: Shots, item: Item, options: PhotoOptions, white: White | None = None
+    shots: Shots, item: Item, options: PhotoOptions, white_balance: BalanceMode | None = None
 ) -> tuple[OpenShot, int] | None:
     """Return the open shot of an item and its frame number; None for a photo."""
     if item.output_base not in shots.places:
         return None
     shot, number = shots.places[item.output_base]
     if shots.opened is None or shots.opened.shot is not shot:
-        shots.opened = OpenShot(shot, options, white)
+        shots.opened = OpenShot(shot, options, white_balance)
     return shots.opened, number

@@ -20,7 +20,7 @@ from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb
 from facerf_cli.image.strips import fitted, resized
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.person import fit
-from facerf_cli.relighting import White
+from facerf_cli.relighting import BalanceMode
 from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.stack import face_in_stack
@@ -67,9 +67,9 @@ def write_page(path: Path, item: Item, photo: np.ndarray, face: FittedFace, work
     matte = None if face.matte is None else resized(face.matte, *photo.shape[:2])
     normals = read_normals(item, work.normals_from, photo.shape[:2])
     with naming(item.input_path):
-        basis, plate = of_photo(load_models_once(work.photo), photo, head, matte, work.white, normals)
+        basis, plate = of_photo(load_models_once(work.photo), photo, head, matte, work.white_balance, normals)
     title = item.input_path.name + face.tag.replace("_", " ")
-    more = ["--white", work.white] if work.white != "photo" else []
+    more = ["--white-balance", work.white_balance] if work.white_balance != "keep" else []
     more += [] if work.normals_from is None else ["--normals-from", str(work.normals_from)]
     words = [str(item.input_path), *photo_words(work.photo, face.number), *more]
     _write(path, title, words, basis, plate, head_place(head.fit.crop, plate.matte), item.key)
@@ -80,11 +80,11 @@ def of_photo(
     photo: np.ndarray,
     head: Head,
     matte: np.ndarray | None = None,
-    white: White | None = None,
+    white_balance: BalanceMode | None = None,
     normals: np.ndarray | None = None,
 ) -> tuple[Basis, Plate]:
     """Return the basis of a photo's person, and the images that a page shows around it."""
-    person = fit(models, photo, matte=matte, white=white, head=head, normals=normals)
+    person = fit(models, photo, matte=matte, white_balance=white_balance, head=head, normals=normals)
     people = PeopleInPhoto([person.in_photo()])
     basis = basis_of_photo(person, people)
     return basis, Plate(photo, people.matte, photo - people.original_layer(), person.uniform_intensity)

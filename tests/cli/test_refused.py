@@ -78,6 +78,7 @@ WRONG: dict[str, dict[str, str]] = {
         "--ball mirror": "No such option: --ball ... estimate-light",
         "--exposure-group a": "No such option: --exposure-group ... pass one --exposure EV",
         "--match-tones": "No such option: --match-tones ... use --light-wrap",
+        "--white scene": "No such option: --white ... use --white-balance",
         "--room 0.1": "No such option: --room ... use --ambient",
         "--matte-from rembg:u2net": "No such option: --matte-from ... pass --person",
         "--ocio who.csv": "Error reading OCIO config",

@@ -347,7 +347,7 @@ def test_near_lights_may_turn_the_head(given: Path, tmp_path: Path) -> None:
         ("0,0", "--pose 1,2,3"),
         ("0,0", "--background 0,0,0"),
         ("0,0", "--network-alone"),
-        ("0,0", "--white scene"),
+        ("0,0", "--white-balance neutral"),
         ("original", "--light"),
         ("delight", "--light"),
         ("at=0.6,0,0.4", "--light"),

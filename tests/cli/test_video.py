@@ -273,7 +273,7 @@ def test_a_photo_under_a_turning_map_becomes_a_video(
         capsys.readouterr()
         assert facerf(given, "relight", given / "small.png", *line, *CHEAP) == 0
         assert "up to date" in capsys.readouterr().err and out.read_bytes() == before
-    other = (*line, *CHEAP, "--white", "scene")
+    other = (*line, *CHEAP, "--white-balance", "neutral")
     for more in ((), ("--dry-run",)):
         assert facerf(given, "relight", given / "small.png", *other, *more) == 1
         assert f"{out}: was not written by facerf" in capsys.readouterr().err

@@ -41,7 +41,9 @@ def bumpy() -> np.ndarray:
 
 def fitted(normals: np.ndarray, **more: Any) -> Person:
     person = astronaut.person()
-    return fit(person.models, astronaut.photo(), head=person.head, white=None, normals=normals, **more)
+    return fit(
+        person.models, astronaut.photo(), head=person.head, white_balance=None, normals=normals, **more
+    )
 
 
 @pytest.fixture(scope="module")

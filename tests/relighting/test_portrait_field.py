@@ -97,7 +97,7 @@ def test_under_its_own_light_the_photo_comes_back_and_no_face_is_seen_through_wh
 def test_a_grey_photo_stays_grey_in_white_light(models: Models, photo: np.ndarray) -> None:
     grey = np.repeat(photo.mean(2, keepdims=True), 3, 2)
     face = find_faces(SHIPPED_NETWORKS.people, grey, "grey")[0]
-    person = fit(models, grey, face=face, texture_side=64, white=None)
+    person = fit(models, grey, face=face, texture_side=64, white_balance=None)
     image = person.image(lamp(60), Target(background="none"))
     np.testing.assert_allclose(image, np.repeat(image[..., 1:2], 3, 2), atol=1e-5)
 

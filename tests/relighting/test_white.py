@@ -11,7 +11,7 @@ from facerf_cli.face.topology import region_mask
 from facerf_cli.image.colour import luminance
 from facerf_cli.image.skin import skin_albedo
 from facerf_cli.portrait.parse import CLASSES, class_index
-from facerf_cli.relighting import White
+from facerf_cli.relighting import BalanceMode
 from facerf_cli.relighting.field import Field, shrunk
 from facerf_cli.relighting.fitting import reflectance_of
 from facerf_cli.relighting.photo_light import estimate_light
@@ -30,19 +30,19 @@ def of_colour(colour: Tensor) -> Tensor:
     return colour[:, None, None] * torch.linspace(0.4, 1, SIZE[1]).expand(1, *SIZE)
 
 
-def balance(white: White, light: Tensor, **given: Tensor) -> WhiteBalance:
+def balance(mode: BalanceMode, light: Tensor, **given: Tensor) -> WhiteBalance:
     """The balance of pale skin in a light, which is relit with a cast."""
     found = {"relit": of_colour(PALE * CAST), "photo": of_colour(PALE * light), "skin": torch.ones(SIZE)}
-    return WhiteBalance.of(white, **(found | given))
+    return WhiteBalance.of(mode, **(found | given))
 
 
 def test_skin_gets_the_photos_chromaticity_at_its_luminance_also_far_from_white() -> None:
-    gain = balance("photo", WARM).gain
+    gain = balance("keep", WARM).gain
     white = PALE * CAST * gain
     torch.testing.assert_close(white / white[1], PALE * WARM / (PALE * WARM)[1], rtol=1e-4, atol=0)
     assert luminance(white.numpy()) == pytest.approx(float(luminance((PALE * CAST).numpy())), rel=1e-4)
-    found = balance("scene", ORANGE)
-    assert found.is_strongly_coloured and balance("photo", ORANGE).is_strongly_coloured
+    found = balance("neutral", ORANGE)
+    assert found.is_strongly_coloured and balance("keep", ORANGE).is_strongly_coloured
     white = PALE * CAST * found.gain  # the cast skin is none, so its nearest one is taken
     chroma = (white / white[1])[::2].log()
     skins = torch.rand(1, 2, 300, 300, generator=torch.Generator().manual_seed(0)).square()
@@ -52,38 +52,38 @@ def test_skin_gets_the_photos_chromaticity_at_its_luminance_also_far_from_white(
     torch.testing.assert_close(
         found.light, (ORANGE * PALE / white / ORANGE[1] * white[1] / PALE[1])[::2].log()
     )
-    found = balance("scene", torch.ones(3))
+    found = balance("neutral", torch.ones(3))
     assert not found.is_strongly_coloured and found.light.abs().max() < 0.02
-    torch.testing.assert_close(found.gain, balance("photo", torch.ones(3)).gain, rtol=0.02, atol=0)
-    assert error("photo") < 0.03 < 0.3 < error("scene")
+    torch.testing.assert_close(found.gain, balance("keep", torch.ones(3)).gain, rtol=0.02, atol=0)
+    assert error("keep") < 0.03 < 0.3 < error("neutral")
 
 
 def test_the_colour_of_shade_has_no_part_in_a_scene() -> None:
     tint = torch.tensor([1.1, 0.8, 1.1])[:, None, None]
     shade = torch.where(torch.arange(SIZE[1]) < 17, tint, 1)  # more than half of the skin, the darker one
     tinted = of_colour(PALE) * shade
-    plain = balance("scene", torch.ones(3)).gain
-    torch.testing.assert_close(balance("scene", torch.ones(3), photo=tinted).gain, plain)
-    assert (balance("photo", torch.ones(3), photo=tinted).gain - plain).abs().max() > 0.05
+    plain = balance("neutral", torch.ones(3)).gain
+    torch.testing.assert_close(balance("neutral", torch.ones(3), photo=tinted).gain, plain)
+    assert (balance("keep", torch.ones(3), photo=tinted).gain - plain).abs().max() > 0.05
 
 
 def test_few_grey_clipped_or_black_pixels_of_skin_change_nothing() -> None:
     few = torch.zeros(SIZE)
     few.flatten()[:499] = 1
     grey = of_colour(torch.full((3,), 0.5))
-    for found in (balance("photo", WARM, skin=few), balance("photo", WARM, photo=grey)):
+    for found in (balance("keep", WARM, skin=few), balance("keep", WARM, photo=grey)):
         assert (
             found.gain.tolist() == [1, 1, 1]
             and found.light.tolist() == [0, 0]
             and not found.is_strongly_coloured
         )
     few.flatten()[499] = 1
-    assert balance("photo", WARM, skin=few).gain.tolist() != [1, 1, 1]
+    assert balance("keep", WARM, skin=few).gain.tolist() != [1, 1, 1]
     clean = of_colour(PALE * WARM)
     clean[0] *= torch.linspace(0.8, 1.2, SIZE[1])  # so that a median tells what it is over
     spoilt = clean.clone()
     spoilt[:, :4], spoilt[:, 4:7] = 1.0, 0.001
-    gains = [balance("photo", WARM, photo=photo).gain for photo in (clean, spoilt)]
+    gains = [balance("keep", WARM, photo=photo).gain for photo in (clean, spoilt)]
     torch.testing.assert_close(*gains)
 
 
@@ -95,14 +95,14 @@ def test_cloth_has_a_gain_of_its_own_by_the_same_light() -> None:
     classes[class_index("neck"), : SIZE[0]] = 1
     classes[class_index("garment"), SIZE[0] :] = 1
     shirt = of_colour(torch.full((3,), 0.6))  # white, and relit it is
-    for white, light in (("photo", ORANGE), ("scene", torch.tensor(1.0))):
-        found = balance(white, ORANGE)  # type: ignore[arg-type]
+    for mode, light in (("keep", ORANGE), ("neutral", torch.tensor(1.0))):
+        found = balance(mode, ORANGE)  # type: ignore[arg-type]
         gains = found.gains(
             torch.cat([relit, shirt], 1), torch.cat([photo, shirt * ORANGE[:, None, None]], 1), classes
         )
         torch.testing.assert_close(gains[:, 5, 5], found.gain, rtol=1e-3, atol=0)
         cloth = gains[:, -5, 5]
-        if white == "photo":
+        if mode == "keep":
             torch.testing.assert_close(cloth / cloth[1], light / light[1], rtol=1e-3, atol=0)
         else:  # the light that is taken out of the skin is taken out of the cloth
             taken = torch.stack([found.light[0], found.light.new_zeros(()), found.light[1]]).exp()
@@ -115,10 +115,10 @@ def in_orange() -> Head:
     return replace(head, face=replace(head.face, texture=head.face.texture * ORANGE[:, None, None]))
 
 
-def error(white: White | None) -> float:
+def error(white_balance: BalanceMode | None) -> float:
     """How far skin under even white light is from its log chromaticity in an orange photo."""
     head = in_orange()
-    field = reflectance_of(astronaut.models(), head, "field", white=white)
+    field = reflectance_of(astronaut.models(), head, "field", white_balance=white_balance)
     assert isinstance(field, Field)
     small, even = shrunk(head.face), field.small_under_uniform_light()
     skin = (small.visible * region_mask("skin", small.texture.shape[-1])) > SURE
@@ -130,23 +130,23 @@ def error(white: White | None) -> float:
 def test_the_whole_person_and_the_faces_own_field_have_the_same_white() -> None:
     photo = astronaut.photo() * ORANGE.numpy()
     skin, shirt = {}, {}
-    for white in ("photo", "scene"):
-        found = reflectance_of(astronaut.models(), in_orange(), "portrait", photo=photo, white=white)
+    for mode in ("keep", "neutral"):
+        found = reflectance_of(astronaut.models(), in_orange(), "portrait", photo=photo, white_balance=mode)
         assert isinstance(found, PortraitField)
         maps, classes = found.views[0].maps, found.views[0].person.classes
-        skin[white], shirt[white] = (
+        skin[mode], shirt[mode] = (
             maps.albedo[0][:, classes[class_index(name)] > 0.95].mean(1) for name in ("skin", "garment")
         )
     for part in (skin, shirt):  # both lose the same light
-        taken = (part["photo"] / part["scene"]).log()
+        taken = (part["keep"] / part["neutral"]).log()
         light = [float(taken[k] - taken[1]) for k in (0, 2)]
         assert light[0] > 0.3 and light[1] < -0.3
     toward = torch.nn.functional.normalize(torch.tensor([[0.6, 0.3, 0.8]]), dim=1)
     shown = [
-        reflectance_of(astronaut.models(), astronaut.head(), "field", alone, white=white).relit(
+        reflectance_of(astronaut.models(), astronaut.head(), "field", alone, white_balance=mode).relit(
             toward, torch.ones(1, 1, 3)
         )
-        for white in ("photo", None)
+        for mode in ("keep", None)
         for alone in (False, True)
     ]
     for balanced, plain in zip(shown[:2], shown[2:], strict=True):
@@ -157,9 +157,9 @@ def test_the_whole_person_and_the_faces_own_field_have_the_same_white() -> None:
 @pytest.mark.slow
 def test_the_light_of_a_balanced_photo_is_white_and_that_of_a_party_is_not() -> None:
     head, models = astronaut.head(), astronaut.models()
-    white = estimate_light(models, head, white="scene").light.weights.sum(0)
+    white = estimate_light(models, head, white_balance="neutral").light.weights.sum(0)
     assert ((white / white[1]).log().abs() < 0.1).all()
-    orange = estimate_light(models, in_orange(), white="scene").light.weights.sum(0)
+    orange = estimate_light(models, in_orange(), white_balance="neutral").light.weights.sum(0)
     assert orange[0] > 1.7 * orange[1] and orange[2] < 0.5 * orange[1]
 
 
