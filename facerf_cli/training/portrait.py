@@ -46,7 +46,7 @@ class PortraitObjectiveSettings:
     """Weights of the terms, targets per sample, and the held-out people and draws of each."""
 
     edges: float = 1.0  # of differences of neighbouring roots
-    own: float = 1.0
+    original: float = 1.0
     albedo: float = 0.3
     normals: float = 0.5
     contrast: float = 0.5
@@ -92,15 +92,15 @@ class PortraitObjective(Objective):
         covered = alpha.mean((1, 2, 3)).clamp_min(1e-3).view(-1, 1, 1, 1)
         off = (_root(images * scale) - _root(batch.targets)) * alpha[:, None] / covered[:, None]
         edges = off.diff(dim=-1).abs().mean() + off.diff(dim=-2).abs().mean()
-        own = _root(_relight_by_own(maps, batch) * scale[:, 0]) - _root(F.avg_pool2d(batch.own, SMALL))
-        own = own * F.avg_pool2d(alpha, SMALL) / covered
+        relit, photo = _relight_by_original(maps, batch), F.avg_pool2d(batch.original, SMALL)
+        original = (_root(relit * scale[:, 0]) - _root(photo)) * F.avg_pool2d(alpha, SMALL) / covered
         albedo = (_root(maps.albedo * scale[:, 0]) - _root(batch.albedo)) * alpha / covered
         labelled = batch.labelled.view(-1, 1, 1, 1)
         cosine = (maps.normals * F.normalize(batch.true_normals, dim=1)).sum(1, keepdim=True)
         return {
             "lights": off.abs().mean(),
             "edges": settings.edges * edges,
-            "own": settings.own * own.abs().mean(),
+            "original": settings.original * original.abs().mean(),
             "albedo": settings.albedo * (albedo * labelled).abs().mean(),
             "normals": settings.normals * ((1 - cosine) * labelled * alpha / covered).mean(),
             "contrast": settings.contrast * _contrast_error(images * scale, batch),
@@ -146,8 +146,8 @@ def _error_sums(images: Tensor, sample: PortraitSample) -> Tensor:
     return torch.stack([*sums, torch.stack([root, alpha.mean()])])
 
 
-def _relight_by_own(maps: PortraitMaps, batch: PortraitSample) -> Tensor:
-    """Relight with the photo's own light [B, 3, S / 4, S / 4]."""
+def _relight_by_original(maps: PortraitMaps, batch: PortraitSample) -> Tensor:
+    """Relight with the photo's original light [B, 3, S / 4, S / 4]."""
     side = batch.inputs.image.shape[-1] // SMALL
     small = type(maps)(*(F.interpolate(values, size=(side, side), mode="area") for values in maps))
     visible = F.interpolate(batch.rig_visible, size=small.gain.shape[-2:], mode="area")

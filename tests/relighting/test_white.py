@@ -116,7 +116,7 @@ def in_orange() -> Head:
 
 
 def error(white_balance: BalanceMode | None) -> float:
-    """How far skin under even white light is from its log chromaticity in an orange photo."""
+    """How far skin under uniform white light is from its log chromaticity in an orange photo."""
     head = in_orange()
     field = reflectance_of(astronaut.models(), head, "field", white_balance=white_balance)
     assert isinstance(field, Field)

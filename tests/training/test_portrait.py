@@ -50,7 +50,7 @@ def test_a_perfect_network_pays_nothing_whatever_is_unknown_or_behind() -> None:
     found = terms(wrong, replace(truth(), labelled=torch.zeros(1)))
     assert found["albedo"] == found["normals"] == 0 and found["lights"] > 3e-3
     found = terms(perfect()._replace(albedo=whole(0.8)))
-    assert max(found[name] for name in ("lights", "edges", "own", "albedo")) < 1e-4
+    assert max(found[name] for name in ("lights", "edges", "original", "albedo")) < 1e-4
     assert found["scale"] == pytest.approx(SETTINGS.scale * 0.6931, rel=1e-3)
     wrong = perfect().albedo.clone()
     wrong[..., SIDE // 2 + 4 :] = 3.0  # beyond the pixels that are averaged with the person's
@@ -60,13 +60,13 @@ def test_a_perfect_network_pays_nothing_whatever_is_unknown_or_behind() -> None:
 @pytest.mark.parametrize(
     ("change", "dearer"),
     [
-        ({"albedo": whole(torch.tensor([0.6, 0.4, 0.2]))}, {"lights", "own", "albedo"}),
+        ({"albedo": whole(torch.tensor([0.6, 0.4, 0.2]))}, {"lights", "original", "albedo"}),
         (
             {"normals": whole(F.normalize(torch.tensor([-0.8, 0.1, 1.0]), dim=0))},
-            {"lights", "own", "normals"},
+            {"lights", "original", "normals"},
         ),
-        ({"around": whole(0.5, 16, SIDE // 2)}, {"lights", "own"}),
-        ({"gloss": whole(0.3)}, {"lights", "own"}),
+        ({"around": whole(0.5, 16, SIDE // 2)}, {"lights", "original"}),
+        ({"gloss": whole(0.3)}, {"lights", "original"}),
     ],
 )
 def test_each_term_sees_its_own_faults(change: dict[str, Tensor], dearer: set[str]) -> None:

@@ -42,7 +42,7 @@ def truth() -> PortraitSample:
         rig=RIG[None],
         rig_visible=torch.ones(1, 12, SIDE // 2, SIDE // 2),
         weights=weights,
-        own=whole(own),
+        original=whole(own),
         albedo=whole(0.4),
         true_normals=whole(NORMAL),
         shares=shares,

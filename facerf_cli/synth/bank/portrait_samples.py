@@ -32,7 +32,7 @@ from facerf_cli.synth.shading import Material
 
 _KEY_LIGHT = KeyLight(0.3, 0.01, 2, 0.3, 1.0)
 _CAMERA = SimulatedCamera(grey=0.2, blur_px=1.2, phone=0.2, contrast=(0.0, 0.3))
-SMALL = 4  # pixels along each side that are averaged where the photo's own light is summed
+SMALL = 4  # pixels along each side that are averaged where the photo's original light is summed
 _SHADOWED = 0.25  # share of photos in the shadow of something that they do not show
 _EMPTY_BYTES = 1000  # a file without tensors is smaller
 _BRIGHTEST = 8.0  # of targets; brighter highlights are clipped
@@ -66,10 +66,10 @@ class PortraitSample(Batch):
     lights: Tensor  # [B, T, 3] of the targets
     visible: Tensor  # [B, T, s, s]
     targets: Tensor  # [B, T, 3, S, S]
-    rig: Tensor  # [B, L, 3] of the photo's own light
+    rig: Tensor  # [B, L, 3] of the photo's original light
     rig_visible: Tensor  # [B, L, s, s]
     weights: Tensor  # [B, L, 3]
-    own: Tensor  # [B, 3, S, S] the photo without noise
+    original: Tensor  # [B, 3, S, S] the photo without noise
     albedo: Tensor  # [B, 3, S, S], known where `labelled` is 1
     true_normals: Tensor  # [B, 3, S, S], likewise
     shares: Tensor  # [B, C, S, S] of the true classes
@@ -206,7 +206,7 @@ def sample_of(
         rig=lit.rig,
         rig_visible=visible,
         weights=lit.weights,
-        own=images[0] * scale,
+        original=images[0] * scale,
         albedo=albedo * scale,
         true_normals=normals if lit.normals is None else lit.normals,
         shares=shares,

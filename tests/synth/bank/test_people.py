@@ -131,7 +131,7 @@ def test_samples_are_exposed_by_the_skin(folder: Path) -> None:
         skin = sample.inputs.classes[:, SKIN]
         mean = (image.mean(1) * skin).sum() / skin.sum()
         assert float(mean) == pytest.approx(MEAN_RADIANCE, rel=1e-3)
-    small = F.avg_pool2d(sample.own, 8), F.avg_pool2d(sample.inputs.image, 8)
+    small = F.avg_pool2d(sample.original, 8), F.avg_pool2d(sample.inputs.image, 8)
     covered = F.avg_pool2d(1 - sample.shares[:, :1], 8)[0, 0] > 0.99
     dark, light = (x.mean(1)[0][covered] for x in small)
     assert float(torch.corrcoef(torch.stack([dark, light]))[0, 1]) > 0.8
