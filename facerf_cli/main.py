@@ -199,7 +199,8 @@ def _defaults(table: Mapping[str, Any], command: Any, where: str, typed: str) ->
         elif name in names:
             values[names[name]] = value
         else:
-            raise UsageError(f"{where} {name}: no such command or option; see `{typed} --help-all`")
+            advice = _REMOVED.get(f"--{name}", f"see `{typed} --help-all`")
+            raise UsageError(f"{where} {name}: no such command or option; {advice}")
     return values
 
 

@@ -52,3 +52,9 @@ def test_a_file_on_the_command_line_replaces_that_of_the_environment(
         said = capsys.readouterr().out
         assert "a_light_5_5.png" in said and "40_10" not in said
     assert main(line) == 0 and "40_10" in capsys.readouterr().out
+
+
+def test_a_removed_option_names_its_replacement(config: Path, capsys: Said) -> None:
+    config.write_text("[relight]\nroom = '0.1'\n")
+    assert main(["--config", str(config), "relight", "a.png", "--light", "5,5", "-o", "out"]) == 2
+    assert "room: no such command or option; use --ambient" in capsys.readouterr().err
