@@ -217,7 +217,7 @@ class Person:
                 is scaled to cover the frame; or a colour (r, g, b).
             layers: Names of layers, as for `facerf relight --aov`. The result is then a dict of "image" and
                 the layers [H, W] or [H, W, C].
-            ambient: Uniform ambient fill, as a fraction from 0 to 1 of all lights except maps.
+            ambient: Uniform ambient fill: a fraction, 0 to 1, of all lights except maps.
             alone: Render only the face, in the pose of the photo, as [H, W, 4].
 
         Gradients flow to the lights, the pose and the texture if only the face is rendered (docs/python.md).
