@@ -22,8 +22,7 @@ import typer
 
 from facerf_cli._version import __version__
 from facerf_cli.batch.settings import Settings, torch_device
-from facerf_cli.cli.brief import Verb, Verbs
-from facerf_cli.cli.examples import epilog_of, examples_of
+from facerf_cli.cli.help import Verb, Verbs, epilog_of, examples_of
 from facerf_cli.cli.options import EPILOG, unwrapped, was_given, with_groups
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.run import memory
@@ -120,6 +119,13 @@ class _Verbs(Verbs):
         super().__init__(**settings)
         self.commands = _Commands(self.commands)  # type: ignore[assignment]
 
+    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
+        """Take defaults of all options from `--config`, wherever it stands, or $FACERF_CONFIG."""
+        named = re.findall(r"(?:^|\0)--config[=\0]([^\0]*)", "\0".join(args))
+        if path := named[-1] if named else os.environ.get("FACERF_CONFIG"):
+            extra["default_map"] = read_config(Path(path), self)
+        return super().make_context(info_name, args, parent, **extra)
+
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Print the help with a line for each command, without importing its file."""
         commands, make = self.commands, typer.core.TyperCommand
@@ -153,55 +159,34 @@ def _print_version(wanted: bool) -> None:
         raise typer.Exit()
 
 
-def _take_defaults(context: typer.Context, path: Path | None) -> Path | None:
-    """Take defaults from a configuration file, also for options in front of `--config`."""
-    root = context.find_root()
-    if path is None:
-        return None
-    root.default_map = read_config(path, root.command)
-    if context is not root:
-        assert context.parent is not None and context.info_name is not None
-        context.default_map = (context.parent.default_map or {}).get(context.info_name)
-        for option in root.command.params:
-            if not option.is_eager and not was_given(root, option.name or ""):
-                option.handle_parse_result(root, {}, [])
-    return path
-
-
-def read_config(path: Path, group: Any) -> dict[str, Any]:
-    """Read defaults from a TOML file, for typer: a table of options per command, and [global] for all.
-
-    Raises UsageError for a file that is not TOML, and for a command or an option that does not exist.
-    """
+def read_config(path: Path, command: Any) -> dict[str, Any]:
+    """Read defaults from a TOML file, for typer: a table of options per command, and [global] for all."""
     from facerf_cli.files.texts import read_toml  # --help does without it
-
-    try:
-        tables = read_toml(path, "correct it")
-    except InputError as error:
-        raise UsageError(f"--config {error}") from None
-    if not isinstance(of_all := tables.pop("global", {}), dict):
-        raise UsageError(f"--config {path}: global is not a table; write [global]")
-    return _defaults(tables | of_all, group, f"--config {path}:", "facerf")
-
-
-def _defaults(table: Mapping[str, Any], command: Any, where: str, typed: str) -> dict[str, Any]:
-    """Return the values of a command's options by typer's names, and those of its subcommands."""
     from facerf_cli.training.settings import KINDS  # tables of [train], which it reads itself
 
-    options = (option for option in command.params if not option.is_eager)
-    names = {word.lstrip("-"): option.name for option in options for word in option.opts}
-    names |= {name: name for name in KINDS if typed == "facerf train"}
-    commands = getattr(command, "commands", {})
-    values = {}
-    for name, value in table.items():
-        if name in commands and isinstance(value, Mapping):
-            values[name] = _defaults(value, commands[name], where, f"{typed} {name}")
-        elif name in names:
-            values[names[name]] = value
-        else:
-            advice = _REMOVED.get(f"--{name}", f"see `{typed} --help-all`")
-            raise UsageError(f"{where} {name}: no such command or option; {advice}")
-    return values
+    def values(table: Mapping[str, Any], command: Any, typed: str) -> dict[str, Any]:
+        options = (option for option in command.params if not option.is_eager)
+        names = {word.lstrip("-"): option.name for option in options for word in option.opts}
+        names |= {name: name for name in KINDS if typed == "facerf train"}
+        defaults: dict[str, Any] = {}
+        for name, value in table.items():
+            inner = getattr(command, "commands", {}).get(name)
+            if name == "global" and isinstance(value, dict):
+                defaults |= values(value, command, typed)
+            elif inner and isinstance(value, dict):
+                defaults[name] = values(value, inner, f"{typed} {name}")
+            elif name in names:
+                defaults[names[name]] = value
+            else:
+                where = f"--config {path}: {name}"
+                advice = _REMOVED.get(f"--{name}", f"see `{typed} --help-all`")
+                raise UsageError(f"{where}: no such command or option; {advice}")
+        return defaults
+
+    try:
+        return values(read_toml(path, "correct it"), command, "facerf")
+    except InputError as error:
+        raise UsageError(f"--config {error}") from None
 
 
 def _global_options(
@@ -211,10 +196,9 @@ def _global_options(
         Path | None,
         typer.Option(
             "--config",
-            envvar="FACERF_CONFIG",
-            callback=_take_defaults,
             is_eager=True,
             metavar="FILE",
+            envvar="FACERF_CONFIG",
             help="TOML file with defaults of options (docs/batch.md).",
             show_default=False,
         ),

@@ -11,12 +11,12 @@ import pytest
 import torch
 
 from facerf_cli.batch import journal
+from facerf_cli.cli import relight
 from facerf_cli.face.importers.ict import ict_source as ict_source_of
 from facerf_cli.face.importers.resample import resample_model
 from facerf_cli.face.importers.source import SourceModel
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.run import memory
-from facerf_cli.work import light_setups
 
 # A shell that starts the tests in the background ignores SIGINT, and children inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -92,7 +92,7 @@ def _cache_of_journals(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Non
     """Keep the journals of files that `-o` names, and maps, out of the user's cache."""
     folder, in_cache = tmp_path_factory.mktemp("journals"), journal._in_cache
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(light_setups, "_cached", lambda *parts: folder.joinpath(*parts))
+        patch.setattr(relight, "_cached", lambda *parts: folder.joinpath(*parts))
         patch.setattr(journal, "_in_cache", lambda file: folder / in_cache(file).name)
         yield
 

@@ -36,13 +36,13 @@ from facerf_cli.files.light_files import (
     write_light,
 )
 from facerf_cli.files.olat_stack import is_olat_stack, read_olat_header, read_olats
+from facerf_cli.files.output_options import parse_exposure
 from facerf_cli.files.read import read_image
 from facerf_cli.files.texts import read_light_list
 from facerf_cli.light.entries import lit_images, parse_lights
 from facerf_cli.main import app, read_config
 from facerf_cli.network.checkpoint import load_checkpoint, load_networks
 from facerf_cli.run.logs import escaped, json_line, printable_line
-from facerf_cli.work.output_options import parse_exposure
 from facerf_cli.work.photo_options import parse_pose
 
 # The same examples each time, in a second or two.

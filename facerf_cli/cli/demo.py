@@ -9,17 +9,15 @@ from typing import Annotated
 import typer
 
 from facerf_cli.batch.inputs import collect_items
-from facerf_cli.batch.journal import Journal
-from facerf_cli.batch.recipe import key_of, recipe_of
-from facerf_cli.cli.examples import examples_of
+from facerf_cli.cli.help import examples_of
 from facerf_cli.cli.options import settings_of
-from facerf_cli.cli.relight import RelightJob
+from facerf_cli.cli.relight import plan_relight
 from facerf_cli.errors import UsageError
+from facerf_cli.files.output_options import OutputOptions
+from facerf_cli.light.setups import LightSources
 from facerf_cli.run.logs import LOGGER_NAME
-from facerf_cli.work.light_setups import LightSources
-from facerf_cli.work.output_options import OutputOptions
 from facerf_cli.work.photo_options import PhotoOptions
-from facerf_cli.work.relight_options import BackgroundChoice, RelightOptions, plan_relight
+from facerf_cli.work.relight_options import BackgroundChoice, RelightOptions
 
 _DEMO = Path(__file__).parents[1] / "assets/demo"
 _LIGHTS = ("-75,0", "-35,25", "50,20", "0,60")
@@ -35,19 +33,15 @@ def demo(
 ) -> None:
     """Relight an included photo under four maps and four single lights, and write a contact sheet.
 
-    This takes about 15 seconds. Files that facerf did not write are not replaced. The photo shows Eileen
+    This takes about 15 seconds. An existing file is not replaced. The photo shows Eileen
     Collins (NASA, public domain).
     """
     if output.suffix.lower() not in (".jpg", ".png"):
         raise UsageError(f"-o {output}: not an image; use a file that ends in .jpg or .png")
+    if output.exists():
+        raise UsageError(f"-o {output}: file exists; remove it, or use another name")
     settings, level = settings_of(context), log.level
     photo, maps = _DEMO / "astronaut.jpg", sorted(map(str, _DEMO.glob("maps/*.exr")))
-    journal = Journal(output.parent, "demo", file=output)
-    recipe = key_of(recipe_of(settings, journal.digest_of))
-    (item,) = collect_items([str(photo)], output.parent)
-    if not journal.to_make(item, [output], [recipe], "changed"):
-        log.info("%s: up to date", output)
-        return
     log.setLevel(logging.WARNING if level == logging.INFO else level)  # hides the photo's long path
     options = RelightOptions(
         photo=PhotoOptions(settings),
@@ -57,19 +51,15 @@ def demo(
     with tempfile.TemporaryDirectory() as folder:
         plan = plan_relight(options, LightSources(envmap=maps, light=[*_LIGHTS]), Path(folder))
         (item,) = collect_items([str(photo)], Path(folder))
-        images = RelightJob(plan).ready(dry_run=False).process(item).outputs
+        images = plan.ready(dry_run=False).process(item).outputs
         words = [*(f"--envmap {Path(path).name}" for path in maps), *(f"--light {azel}" for azel in _LIGHTS)]
-        key = journal.key_of(item, recipe)
-        _write_sheet(output, [photo, *images], ["the photo", *words], {"facerf:key": key})
-        journal.add_file(item, output, recipe)
+        _write_sheet(output, [photo, *images], ["the photo", *words])
     log.setLevel(level)
     print(output)
     log.info("your own photo: %s", examples_of("relight")[0])
 
 
-def _write_sheet(
-    sheet: Path, images: Sequence[Path], words: Sequence[str], metadata: dict[str, str | int | float]
-) -> None:
+def _write_sheet(sheet: Path, images: Sequence[Path], words: Sequence[str]) -> None:
     """Write images in three columns, each with its word below."""
     import numpy as np  # --help does without it
 
@@ -84,4 +74,4 @@ def _write_sheet(
         )
         for path, word in zip(images, words, strict=True)
     ]
-    write_display(sheet, contact_sheet(np.stack(tiles), columns=3), metadata=metadata)
+    write_display(sheet, contact_sheet(np.stack(tiles), columns=3))

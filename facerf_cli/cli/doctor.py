@@ -1,6 +1,5 @@
 """`facerf doctor`: installed and missing packages, the device, and networks with licences."""
 
-import os
 import platform
 import re
 from contextlib import suppress
@@ -14,7 +13,6 @@ from facerf_cli.batch.settings import Settings, torch_device
 from facerf_cli.cli.options import settings_of
 from facerf_cli.errors import FacerfError
 from facerf_cli.run.logs import json_line
-from facerf_cli.run.machine import memory_bytes
 
 _MISSING = "MISSING"
 EXTRAS = {  # of the package (pyproject.toml), and their uses; others are developers' tools
@@ -83,24 +81,15 @@ def _packages() -> Facts:
 
 def _machine(settings: Settings) -> Facts:
     """Return the sections that need packages."""
-    import OpenImageIO as oiio
     import platformdirs
     import torch
 
     device = torch_device(settings)
     built = f"built for CUDA {torch.version.cuda}" if torch.version.cuda else "built without CUDA"
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else f"this torch is {built}"
-    configuration = oiio.ColorConfig()
-    if trouble := configuration.geterror():
-        raise FacerfError(f"$OCIO is {os.environ.get('OCIO', '')!r}: {trouble}")
     return {
-        "device": {
-            "name": f"{device} ({name})",
-            "threads": torch.get_num_threads(),
-            "memory": f"{memory_bytes() / 2**30:.0f} GiB",
-        },
+        "device": {"name": f"{device} ({name})"},
         "networks": _networks(settings),
-        "colour": {"OCIO configuration": configuration.configname()},
         "cache": {"folder": platformdirs.user_cache_dir("facerf")},
     }
 

@@ -8,7 +8,7 @@ import typer
 from facerf_cli.batch.settings import BatchOptions
 from facerf_cli.cli.options import settings_of
 from facerf_cli.option import LIGHT, Only, option
-from facerf_cli.work.photo_work import LARGEST_MAP_PX, refuse_odd
+from facerf_cli.work.photo_options import LARGEST_MAP_PX, refuse_odd
 
 
 @dataclass(frozen=True)

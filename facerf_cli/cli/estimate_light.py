@@ -8,30 +8,15 @@ import typer
 
 from facerf_cli.batch.inputs import Item
 from facerf_cli.cli.options import FramesArgument
-from facerf_cli.option import LIGHT, option
 from facerf_cli.work.photo_options import LightOptions, refuse
-from facerf_cli.work.photo_work import (
-    LARGEST_MAP_PX,
-    MOST_ORDER,
-    FileOrFolder,
-    PhotoWork,
-    Written,
-    refuse_odd,
-)
+from facerf_cli.work.photo_work import FileOrFolder, PhotoWork, Written
 from facerf_cli.work.shots import ShotOptions, Shots, collect_frames, whole_shots
 
 
 @dataclass(frozen=True, kw_only=True)
 class EstimateLight(PhotoWork, LightOptions):
-    """`facerf estimate-light`.
+    """`facerf estimate-light`."""
 
-    Attributes:
-        width_px: Width of the map; its height is half of it.
-        sh_order: Order of the spherical harmonics in the JSON.
-    """
-
-    width_px: int = option(512, metavar="PX", least=16, most=LARGEST_MAP_PX, panel=LIGHT)
-    sh_order: int = option(2, least=0, most=MOST_ORDER, panel=LIGHT)
     verb = "estimate-light"
     endings = ("_light.exr", "_light.json", "_light.png")
     networks = LightOptions.networks
@@ -39,7 +24,6 @@ class EstimateLight(PhotoWork, LightOptions):
 
     def run(self, inputs: Sequence[str], batch: FileOrFolder, frames: ShotOptions | None = None) -> int:
         """Estimate the light of each photo, and one light per take of a shot; return the exit code."""
-        refuse_odd("--width", self.width_px)
         self.photo.check()
         self.check()
         items, shots = collect_frames(inputs, frames or ShotOptions(), batch, self.photo)
@@ -63,8 +47,8 @@ class EstimateLight(PhotoWork, LightOptions):
 
         for shot in self.shots.all:
             if item.output_base == shot.base:
-                return write_shot_light(shot, item, self, self.width_px, self.sh_order)
-        return write_lights(item, self, self.width_px, self.sh_order)
+                return write_shot_light(shot, item, self)
+        return write_lights(item, self)
 
 
 def estimate_light(

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from facerf_cli.cli.brief import Verbs
+from facerf_cli.cli.help import Verbs
 from facerf_cli.cli.options import refuse_given, with_groups
 from facerf_cli.errors import UsageError
 from facerf_cli.evaluation.options import (

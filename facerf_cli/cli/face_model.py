@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from facerf_cli.batch.inputs import refuse_read
-from facerf_cli.cli.brief import Verbs
+from facerf_cli.cli.help import Verbs
 from facerf_cli.errors import UsageError
 from facerf_cli.run.logs import LOGGER_NAME
 

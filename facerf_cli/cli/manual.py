@@ -8,7 +8,7 @@ from typing import Any
 import typer.main
 
 from facerf_cli._version import __version__
-from facerf_cli.cli.examples import examples_of
+from facerf_cli.cli.help import examples_of
 from facerf_cli.cli.options import EPILOG
 from facerf_cli.errors import UsageError
 from facerf_cli.main import app

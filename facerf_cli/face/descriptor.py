@@ -1,6 +1,7 @@
 """Face-recognition descriptor from dlib (an extra), for the paper's Face dis and for `--identity`."""
 
 import importlib
+from collections.abc import Callable
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from facerf_cli.errors import FacerfError
+from facerf_cli.image.colour import display_ev, linear_to_srgb
 from facerf_cli.raster.camera import PIXEL_CENTRE
 
 LICENCE = (
@@ -36,6 +38,16 @@ def face_descriptor(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> np.ndar
     box = dlib.rectangle(round(left), round(top), round(right), round(bottom))
     shape = dlib.full_object_detection(box, points)
     return np.array(recognition.compute_face_descriptor(np.ascontiguousarray(image), shape))
+
+
+def distances_from(photo: np.ndarray, landmarks_px: np.ndarray) -> Callable[[np.ndarray], float]:
+    """Return a function that measures the distance of an exposed image of a face from its photo [H, W, 3]."""
+
+    def descriptor(pixels: np.ndarray) -> np.ndarray:
+        return face_descriptor(linear_to_srgb(pixels.clip(0, 1)), landmarks_px)
+
+    of_photo = descriptor(photo * np.float32(2.0 ** display_ev(photo)))
+    return lambda pixels: round(float(np.linalg.norm(descriptor(pixels) - of_photo)), 3)
 
 
 @cache  # a network of 20 MB

@@ -194,6 +194,21 @@ def covering(image: np.ndarray, height: int, width: int) -> np.ndarray:
     return covered
 
 
+@dataclass(frozen=True, eq=False)
+class SumOf:
+    """The sum [H, W, 3] of layers over black, computed by rows and divided by alpha [H, W]."""
+
+    layers: Sequence[np.ndarray]
+    width_px: int
+    alpha: np.ndarray | None
+
+    def __getitem__(self, rows: slice, /) -> np.ndarray:
+        total = np.zeros((rows.stop - rows.start, self.width_px, 3), np.float32)
+        for layer in self.layers:
+            total += rows_of(layer, rows)
+        return total if self.alpha is None else total / np.maximum(self.alpha[rows], 1e-3)[..., None]
+
+
 class Resized:
     """`resized` by rows; when it enlarges, rows are computed on access."""
 

@@ -62,9 +62,7 @@ Tiles = dict[str, np.ndarray]  # images [256, w, 3] of a sheet, linear, by their
 log = logging.getLogger(LOGGER_NAME)
 
 
-def write_shot_light(
-    shot: Shot, item: Item, options: LightOptions, width_px: int, sh_order: int
-) -> tuple[list[str], Any]:
+def write_shot_light(shot: Shot, item: Item, options: LightOptions) -> tuple[list[str], Any]:
     """Estimate and write the light of each take that shows the face, from key frames together.
 
     Returns the takes' tags, and facts for the report.
@@ -76,13 +74,13 @@ def write_shot_light(
         take = opened.take_of(frames.start)
         image, face = opened.fitted(take.middle, portrait=False)
         face = replace(face, tag=f"_take{len(tags) + 1}" if tags else "")
-        written = _write_estimate(item, image, face, options, width_px, sh_order, take.other_heads)
+        written = _write_estimate(item, image, face, options, take.other_heads)
         tags.append(face.tag)
         facts.append(face.described() | written | {"frames": take.key_frames})
     return tags, (facts[0] if len(facts) == 1 else {"takes": facts}) | facts_of_networks(options.photo)
 
 
-def write_lights(item: Item, options: LightOptions, width_px: int, sh_order: int) -> tuple[list[str], Any]:
+def write_lights(item: Item, options: LightOptions) -> tuple[list[str], Any]:
     """Estimate and write the light of each chosen face of a photo; without a face, guess it.
 
     Returns the faces' tags, and facts for the report.
@@ -92,12 +90,12 @@ def write_lights(item: Item, options: LightOptions, width_px: int, sh_order: int
     def write(face: FittedFace) -> dict[str, Any]:
         if options.photo.landmarks is None and confidence_of(face.facts).word == "doubtful":
             raise NoFaceError(f"{face.name}: its face is too small, dark or unclear to read light from")
-        return {"light_from": "face"} | _write_estimate(item, image, face, options, width_px, sh_order)
+        return {"light_from": "face"} | _write_estimate(item, image, face, options)
 
     try:
         return write_each(item, image, options.photo, write)
     except NoFaceError:
-        return [""], _write_guess(item, image, options, width_px, sh_order)
+        return [""], _write_guess(item, image, options)
 
 
 def _write_estimate(
@@ -105,17 +103,20 @@ def _write_estimate(
     image: LinearImage,
     face: FittedFace,
     options: LightOptions,
-    width_px: int,
-    sh_order: int,
     other_heads: Sequence[Head] = (),
 ) -> dict[str, Any]:
     """Estimate and write the light of a fitted face and `other_heads` of its shot; return facts."""
     models = load_models_once(options.photo)
     features, name = feature_network(options) if options.refine == "features" else (None, None)
     with naming(item.input_path):
+        head, masks = face.head, [] if image.alpha is None else [image.alpha]
+        if options.matte is not None:
+            masks.append(read_matte(item, options.matte, image.pixels.shape[:2]))
+        for mask in masks:
+            head = head.without(models.face, head.fit.crop.apply(mask[..., None])[..., 0])
         estimate = estimate_light(
             models,
-            _masked(item, image, face.head, options, models),
+            head,
             options.reflectance,
             rig_by_text(options.rig),
             Estimator(options.non_negative, features),
@@ -136,20 +137,10 @@ def _write_estimate(
     facts = _facts(estimate, residual, options, name)
     metadata = provenance(item, options.photo, models.checkpoint_name())
     tiles = _explained_tiles(face.head, models, estimate.explained)
-    envmap = rig_to_latlong(estimate.light, width_px // 2)
+    envmap = rig_to_latlong(estimate.light, options.width_px // 2)
     base = item.output(f"{face.tag}_light")
-    _write(base, envmap, estimate.light, sh_order, tiles, options, metadata, facts)
+    _write(base, envmap, estimate.light, tiles, options, metadata, facts)
     return facts
-
-
-def _masked(item: Item, image: LinearImage, head: Head, options: LightOptions, models: Models) -> Head:
-    """Return the head without the parts that the photo's alpha or --matte masks out."""
-    masks = [] if image.alpha is None else [image.alpha]
-    if options.matte is not None:
-        masks.append(read_matte(item, options.matte, image.pixels.shape[:2]))
-    for mask in masks:
-        head = head.without(models.face, head.fit.crop.apply(mask[..., None])[..., 0])
-    return head
 
 
 def _facts(
@@ -191,9 +182,7 @@ def feature_network(options: LightOptions) -> tuple[FeatureNetwork, str]:
     return networks.light_features, f"S_f ({'shipped' if path == SHIPPED['light_features'] else path.name})"
 
 
-def _write_guess(
-    item: Item, image: LinearImage, options: LightOptions, width_px: int, sh_order: int
-) -> dict[str, Any]:
+def _write_guess(item: Item, image: LinearImage, options: LightOptions) -> dict[str, Any]:
     """Guess and write the light of an image without a face; log the expected error, and return facts."""
     fov_deg = options.fov_deg or stated_fov_deg(image) or FOV_DEG
     guess = light_of_picture(torch.from_numpy(image.pixels), fov_deg)
@@ -211,8 +200,8 @@ def _write_guess(
     small = resized(image.pixels, _TILE_PX, max(1, round(width * _TILE_PX / height)))
     tiles = {"picture": small * np.float32(2 ** auto_exposure_ev(image.pixels, None))}
     metadata = Provenance(item.input_path.name, key=item.key).attributes()
-    envmap = resampled(guess.envmap, width_px // 2)
-    _write(item.output("_light"), envmap, light, sh_order, tiles, options, metadata, facts)
+    envmap = resampled(guess.envmap, options.width_px // 2)
+    _write(item.output("_light"), envmap, light, tiles, options, metadata, facts)
     return facts
 
 
@@ -229,7 +218,6 @@ def _write(
     base: Path,
     envmap: Tensor,
     light: RigLight,
-    sh_order: int,
     tiles: Tiles,
     options: LightOptions,
     provenance: Mapping[str, str | int],
@@ -241,7 +229,7 @@ def _write(
         plain = value if isinstance(value, (int, float, str)) else " ".join(map(str, value or ["none"]))
         metadata[f"facerf:light_{name}"] = plain
     write_exr(Path(f"{base}.exr"), envmap.numpy(), metadata=metadata)
-    harmonics, rig = rig_coefficients(light, sh_order), f"--lights {options.rig}"
+    harmonics, rig = rig_coefficients(light, options.sh_order), f"--lights {options.rig}"
     record = LightRecord(light.directions, light.weights, rig, harmonics, metadata)
     write_light(Path(f"{base}.json"), record)
     write_display(Path(f"{base}.png"), _sheet(tiles, envmap), metadata=metadata)

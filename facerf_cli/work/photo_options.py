@@ -6,17 +6,19 @@ Light to import: the help reads them without torch and numpy.
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from facerf_cli.baselines import Kind
 from facerf_cli.batch.inputs import COMPANION, OF_FILES, NamePattern
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import UsageError
 from facerf_cli.light.entries import numbers, parse_lights
+from facerf_cli.light.setups import fov_option
 from facerf_cli.option import FACE, IMAGE, LIGHT, METHOD, flag, option
 from facerf_cli.relighting import BalanceMode
 
 MOST_ESTIMATED = 1024  # lights; above it the non-negative least squares take minutes
+LARGEST_MAP_PX, _MOST_ORDER = 8192, 20
 _TEXTURE_STEP, _TEXTURE_MOST = 256, 2048
 FITTING = frozenset({"parsing"})  # networks that find faces for a fit
 NETWORKS = {  # of reflectance models
@@ -27,19 +29,6 @@ NETWORKS = {  # of reflectance models
 Geometry = Literal["landmarks", "network"]
 Refine = Literal["none", "features"]
 PoseDeg = tuple[float, float, float]
-
-
-def fov_option() -> Any:
-    """Make the field of `--fov`."""
-    return option(
-        None,
-        flags=("--fov",),
-        metavar="DEG",
-        least=1.0,
-        most=170.0,
-        shown_default="its EXIF, or 60",
-        panel=LIGHT,
-    )
 
 
 @dataclass(frozen=True)
@@ -173,6 +162,8 @@ class LightOptions(SolveOptions):
         vgg_weights: The paper's V_f for --refine features: imagenet downloads it once (528 MiB); or a file.
         keep_eyes: Also use the eyes, which the paper leaves out.
         fov_deg: Horizontal angle of view of an image without a face.
+        width_px: Width of the map; its height is half of it.
+        sh_order: Order of the spherical harmonics in the JSON.
         matte: Grey image, or its alpha, of the part to use, such as skin; --person replaces the detected
             matte.
     """
@@ -188,6 +179,8 @@ class LightOptions(SolveOptions):
     )
     keep_eyes: bool = option(False, panel=FACE)
     fov_deg: float | None = fov_option()
+    width_px: int = option(512, metavar="PX", least=16, most=LARGEST_MAP_PX, panel=LIGHT)
+    sh_order: int = option(2, least=0, most=_MOST_ORDER, panel=LIGHT)
     matte: Path | None = option(None, metavar=COMPANION, shown_default="the photo's alpha", panel=FACE)
 
     @property
@@ -209,6 +202,7 @@ class LightOptions(SolveOptions):
                 ),
             }
         )
+        refuse_odd("--width", self.width_px)
         check_companion(self.matte, "--matte")
 
 
@@ -217,6 +211,11 @@ def refuse(rules: Mapping[str, bool]) -> None:
     for message, is_broken in rules.items():
         if is_broken:
             raise UsageError(message)
+
+
+def refuse_odd(name: str, width_px: int) -> None:
+    """Raise UsageError for a map width whose half is not an integer."""
+    refuse({f"{name} {width_px}: odd, but the height is half of it; use an even number": width_px % 2 > 0})
 
 
 def for_other_photos(photo: PhotoOptions) -> PhotoOptions:

@@ -30,7 +30,6 @@ from facerf_cli.work.photo_options import (
 from facerf_cli.work.shots import FRAMES_IN_A_ROW, ShotOptions, Shots, collect_frames, recipe_of_shots
 
 PHOTOS_A_PROCESS = 4  # from this number on, another worker saves time
-LARGEST_MAP_PX, MOST_ORDER = 8192, 20
 Written = tuple[Sequence[str], Mapping[str, Any]]  # tags of the written faces; facts for the report
 
 
@@ -217,8 +216,3 @@ class PredictOlat(PageWork, FieldOptions):
             }
         )
         return work
-
-
-def refuse_odd(name: str, width_px: int) -> None:
-    """Raise UsageError for a map width whose half is not an integer."""
-    refuse({f"{name} {width_px}: odd, but the height is half of it; use an even number": width_px % 2 > 0})

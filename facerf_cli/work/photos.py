@@ -19,7 +19,6 @@ from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import Head
 from facerf_cli.face.landmarks import read_landmarks
 from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
-from facerf_cli.files.arrays import read_array
 from facerf_cli.files.read import LinearImage, read_image
 from facerf_cli.image.colour import named_space, to_display
 from facerf_cli.image.strips import resized
@@ -166,19 +165,12 @@ def fit_each(item: Item, image: LinearImage, options: PhotoOptions) -> Iterator[
 
     The first face's files are therefore written last, and mark the photo as finished.
     """
-    matte = person_matte(item, image.pixels, options)
-    faces = find_people(item, image, options, matte)
-    return (_fitted(faces.pop(), image, options, matte) for _ in range(len(faces)))
-
-
-def _fitted(
-    face: PhotoFace, image: LinearImage, options: PhotoOptions, matte: np.ndarray | None
-) -> FittedFace:
-    with naming(face.name):
-        models = load_models_once(options)
-        sides = models.sides(options.texture_side)
-        head = head_of(models, image.pixels, face.found, options.geometry, sides, matte)
-    return fitted_face(face, head, matte)
+    models, matte = load_models_once(options), person_matte(item, image.pixels, options)
+    sides = models.sides(options.texture_side)
+    for face in reversed(find_people(item, image, options, matte)):
+        with naming(face.name):
+            head = head_of(models, image.pixels, face.found, options.geometry, sides, matte)
+        yield fitted_face(face, head, matte)
 
 
 def fit_faces(item: Item, image: LinearImage, options: PhotoOptions) -> list[FittedFace]:
@@ -317,6 +309,8 @@ def read_normals(item: Item, file: Path | None, size_px: tuple[int, ...]) -> np.
     path = companion(item, file, "--normals-from")
     with beside(size_px, images=1):
         if path.suffix.lower() == ".npy":
+            from facerf_cli.files.arrays import read_array
+
             normals = read_array(path)
         else:
             normals = read_image(path, "linear", non_finite="zero", with_alpha=False).pixels
@@ -343,9 +337,7 @@ def person_matte(
     matte = _grey_or_alpha(path, (height, width), _WHITE)
     scale = height / len(matte)
     if abs(width - scale * matte.shape[1]) > 2 * max(1.0, scale):  # sides were rounded
-        sizes, turned = _sizes(matte, (height, width)), abs(height - width * matte.shape[1] / len(matte)) <= 2
-        cause = ", probably because EXIF orientation was not applied" if turned else ""
-        raise InputError(f"{path}: {sizes}{cause}; use a matte of the upright photo")
+        raise InputError(f"{path}: {_sizes(matte, (height, width))}; use a matte of the upright photo")
     if not in_shot and (most := matte.max()) < _WHITE:
         level = f"nowhere white (at most {255 * most:.0f} of 255)" if most else "completely black"
         raise InputError(f"{path}: the matte is {level}; make it white where the person is")

@@ -57,7 +57,11 @@ def write_stacks(item: Item, work: PredictOlat) -> Written:
         else:
             header, olats = _of_face(item, face, directions, work, tiles)
         write_olat_stack(stack, header, olats)
-        write_display(sheet, _contact_sheet(tiles, header.directions), "auto", metadata=header.metadata)
+        images = np.concatenate(tiles)
+        white = float(np.percentile(images, 99.5))
+        for thumbnail, direction in zip(images, header.directions, strict=True):
+            mark_light(thumbnail, direction, white)
+        write_display(sheet, contact_sheet(images), "auto", metadata=header.metadata)
         for path in pages:
             write_page(path, item, image.pixels, face, work)
         return {}
@@ -154,12 +158,3 @@ def _common_header(item: Item, directions: Tensor, work: PredictOlat) -> dict[st
 def _tile_px(lights: int) -> int:
     """Return the longer side of a contact sheet's tiles, whose total size is independent of the lights."""
     return min(_TILE_PX, math.isqrt(_SHEET_PX // lights))
-
-
-def _contact_sheet(tiles: list[np.ndarray], directions: np.ndarray) -> np.ndarray:
-    """Return a sheet of every light's image, with the light's direction marked."""
-    images = np.concatenate(tiles)
-    white = float(np.percentile(images, 99.5))
-    for image, direction in zip(images, directions, strict=True):
-        mark_light(image, direction, white)
-    return contact_sheet(images)

@@ -16,11 +16,11 @@ from facerf_cli.batch.run import Outcome
 from facerf_cli.errors import InputError
 from facerf_cli.face.view import photo_camera
 from facerf_cli.files.image_metadata import plate_metadata
+from facerf_cli.files.outputs import OutputImage, write_output
 from facerf_cli.files.read import LinearImage, read_image
 from facerf_cli.files.texts import file_sha256
-from facerf_cli.image.colour import display_ev, linear_to_srgb, most_exposure_ev
-from facerf_cli.image.light_wrap import LightWrap
-from facerf_cli.image.strips import Empty, Rows, Scaled, covering, rows_of
+from facerf_cli.image.colour import most_exposure_ev
+from facerf_cli.image.strips import Empty, Rows, Scaled, SumOf, covering
 from facerf_cli.light.envmap import Backdrop
 from facerf_cli.light.light import Light, intensity_of
 from facerf_cli.light.over_rig import (
@@ -32,7 +32,7 @@ from facerf_cli.light.over_rig import (
     read_map,
     with_ambient,
 )
-from facerf_cli.light.setups import LightSetup
+from facerf_cli.light.setups import LightSetup, image_path
 from facerf_cli.person import Person, Target, fit
 from facerf_cli.raster.camera import Camera, rays_of_rows
 from facerf_cli.relighting.memory import beside, beside_people, canvas, require_face, require_people
@@ -40,8 +40,6 @@ from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.relightable import Relightable, RenderRequest
 from facerf_cli.run.logs import LOGGER_NAME, attributes_of_sum, json_line, step
 from facerf_cli.run.memory import batches
-from facerf_cli.work.light_setups import image_path
-from facerf_cli.work.outputs import OutputImage, write_output
 from facerf_cli.work.photos import (
     FittedFace,
     PhotoFace,
@@ -212,7 +210,11 @@ def _scene_in_photo(item: Item, plan: RelightPlan, read: _Read) -> Scene:
     with naming(item.input_path):
         for face, person in fitted:
             require_face(person.models.face, face.fit, photo.shape[:2])
-    nearest = fitted[0][0]
+    nearest, identity = fitted[0][0], None
+    if options.identity:
+        from facerf_cli.face.descriptor import distances_from
+
+        identity = distances_from(photo, nearest.fit.crop.to_photo(nearest.head.landmarks_px))
     camera = photo_camera(nearest.fit.crop, *photo.shape[:2])
     return Scene(
         subject=PeopleInPhoto([person.in_photo(target) for _, person in fitted], target.background),
@@ -225,7 +227,7 @@ def _scene_in_photo(item: Item, plan: RelightPlan, read: _Read) -> Scene:
         alpha=alpha if keeps_photo else None,
         behind=_backdrop(options.background, options.background_blur, camera),
         plate=plate_metadata(read.image.metadata),
-        identity=_identity_of(photo, nearest) if options.identity else None,
+        identity=identity,
     )
 
 
@@ -268,9 +270,9 @@ def _scene_of_stack(item: Item, plan: RelightPlan) -> Scene:
         "--light delight": any(light.delight for light in lights),
         "--light at=": any(light.at_m is not None for light in lights),
     }
-    for option in (option for option, is_used in needs_photo.items() if is_used):
+    if used := [option for option, is_used in needs_photo.items() if is_used]:
         raise InputError(
-            f"{path}: {option} needs the photo, not its stack; pass the photo, or remove {option}"
+            f"{path}: {used[0]} needs the photo, not its stack; pass the photo, or remove {used[0]}"
         )
     header = read_olat_header(path)
     if header.kind == "texture":
@@ -327,19 +329,6 @@ def _fitted(plan: RelightPlan, read: _Read, face: PhotoFace) -> tuple[FittedFace
     return fitted, person
 
 
-def _identity_of(photo: np.ndarray, face: FittedFace) -> Callable[[np.ndarray], float]:
-    """Return a function: the distance of an image [H, W, 3] from its photo by face descriptors."""
-    from facerf_cli.face.descriptor import face_descriptor
-
-    landmarks_px = face.fit.crop.to_photo(face.head.landmarks_px)
-
-    def descriptor(pixels: np.ndarray) -> np.ndarray:
-        return face_descriptor(linear_to_srgb(pixels.clip(0, 1)), landmarks_px)
-
-    of_photo = descriptor(photo * np.float32(2.0 ** display_ev(photo)))
-    return lambda pixels: round(float(np.linalg.norm(descriptor(pixels) - of_photo)), 3)
-
-
 def _metadata(item: Item, plan: RelightPlan) -> dict[str, str | int]:
     network = "diffuse_sh" if plan.options.reflectance == "diffuse-sh" else "reflectance"
     metadata = provenance(item, plan.photo, load_models_once(plan.photo).checkpoint_name(network))
@@ -377,10 +366,7 @@ def _in_shot(item: Item, plan: RelightPlan) -> Any:
 
 
 def _write_images(
-    item: Item,
-    scene: Scene,
-    plan: RelightPlan,
-    shared_ev: Mapping[str, float] | None,
+    item: Item, scene: Scene, plan: RelightPlan, shared_ev: Mapping[str, float] | None
 ) -> dict[Path, dict[str, float]]:
     """Write the image of every setup; one prediction serves as many images as fit in memory.
 
@@ -438,6 +424,8 @@ def _rendered(
     subject, lit = scene.subject, with_ambient(setup)
     behind, wrap = scene.behind(setup, ev) if scene.behind else None, None
     if behind is not None and plan.options.light_wrap:
+        from facerf_cli.image.light_wrap import LightWrap
+
         wrap = LightWrap(behind, subject.matte, plan.options.light_wrap)
     parts = batches(len(lit.names), subject.nbytes)
     arrays: dict[str, np.ndarray] = {}
@@ -458,21 +446,6 @@ def _rendered(
     return OutputImage(
         pixels, scene.alpha if alpha is None else alpha, layers, matte if keeps else None, added
     )
-
-
-@dataclass(frozen=True, eq=False)
-class SumOf:
-    """The sum [H, W, 3] of layers over black, computed by rows and divided by alpha [H, W]."""
-
-    layers: Sequence[np.ndarray]
-    width_px: int
-    alpha: np.ndarray | None
-
-    def __getitem__(self, rows: slice, /) -> np.ndarray:
-        total = np.zeros((rows.stop - rows.start, self.width_px, 3), np.float32)
-        for layer in self.layers:
-            total += rows_of(layer, rows)
-        return total if self.alpha is None else total / np.maximum(self.alpha[rows], 1e-3)[..., None]
 
 
 def _require_finite(item: Item, setup: LightSetup, relit: Any) -> None:

@@ -1,4 +1,4 @@
-"""Options of `facerf relight`, the rules between them, and the images to render. Light to import."""
+"""Options of `facerf relight`, and the images to render. Light to import."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Literal, Self
 
-from facerf_cli.baselines import Kind, RelightKind
+from facerf_cli.baselines import RelightKind
 from facerf_cli.batch.inputs import (
     COMPANION,
     VIDEO_SUFFIXES,
@@ -19,43 +19,66 @@ from facerf_cli.batch.inputs import (
     only_item,
 )
 from facerf_cli.batch.recipe import DigestOf, Recipe, recipe_of
+from facerf_cli.batch.run import Job
 from facerf_cli.batch.settings import NOT_IN_RECIPE
 from facerf_cli.errors import UsageError
-from facerf_cli.files.texts import file_sha256
-from facerf_cli.light.entries import DELIGHT, ORIGINAL, Sampling, is_sweep, numbers, parse_lights
-from facerf_cli.light.setups import LightSetup
+from facerf_cli.files.output_options import Exposure, OutputOptions, parse_exposure
+from facerf_cli.light.entries import Sampling, numbers
+from facerf_cli.light.setups import CachedMap, LightSetup, image_path
 from facerf_cli.option import BATCH, IMAGE, LIGHT, METHOD, option
-from facerf_cli.work.light_setups import (
-    BACKGROUND,
-    CachedMap,
-    LightSources,
-    PhotoLight,
-    collect_setups,
-    drawn_maps,
-    image_path,
-    photo_lights,
-    set_ambient,
-)
-from facerf_cli.work.output_options import Exposure, OutputOptions, parse_exposure
 from facerf_cli.work.photo_options import (
     FieldOptions,
     LightOptions,
     PhotoOptions,
     PortraitOptions,
     check_companion,
-    for_other_photos,
-    parse_pose,
-    refuse,
 )
 from facerf_cli.work.shots import Shots, recipe_of_shots, video_rate
 
 Composite = Literal["photo", "face"]
 BackgroundKind = Literal["photo", "envmap", "none", "file", "colour"]
-_FIELDS = ("field", "portrait")
-_OF_EVERY_IMAGE = ("person", "class", "rgb", "rgba")  # names of layers
+LIGHT_ENDING = "_light"  # ends the name of a photo's light
+_DRAWN_WIDTH_PX = 512
 _LAYERS = ("matte", "albedo", "normal", "position", "depth", "shadow", "specular", "classes", "face", "uv")
 _LUMINANCE, _DARK = (0.2126, 0.7152, 0.0722), 0.1  # of linear Rec.709; upper limit of a dark colour
 _FORMS = "photo, envmap, none, an image file, a folder, a colour name such as black, #RRGGBB or R,G,B"
+
+
+@dataclass(frozen=True)
+class DrawnMap(CachedMap):
+    """Procedural map in the user's cache."""
+
+    index: int
+    seed: int
+
+    def write(self) -> None:
+        """Draw the map."""
+        from facerf_cli.files.write import write_exr
+        from facerf_cli.synth.sky.skies import draw_sky
+
+        write_exr(self.envmap, draw_sky(self.index, self.seed, _DRAWN_WIDTH_PX)[0])
+
+
+@dataclass(frozen=True)
+class PhotoLight(CachedMap):
+    """The light of a photo, as `facerf estimate-light` writes it.
+
+    Attributes:
+        photo: A photo, or the background image.
+        options: How the light is estimated.
+        is_background: True if the light has the brightness of the background image.
+    """
+
+    photo: Path
+    options: LightOptions
+    is_background: bool = False
+
+    def write(self) -> None:
+        """Estimate the light; raise InputError if the photo cannot be used."""
+        from facerf_cli.work.estimate_light import write_lights
+
+        base = self.envmap.with_name(self.envmap.name.removesuffix(f"{LIGHT_ENDING}.exr"))
+        write_lights(Item(self.photo, base, self.photo.stem), self.options)
 
 
 @dataclass(frozen=True)
@@ -116,14 +139,14 @@ def _named_colour(text: str) -> tuple[float, float, float] | None:
     from PIL import ImageColor  # --help does without it
 
     try:
-        red, green, blue, *_ = (_srgb_to_linear(value / 255) for value in ImageColor.getrgb(text))
+        red, green, blue, *_ = (value / 255 for value in ImageColor.getrgb(text))
     except ValueError:
         return None
-    return red, green, blue
 
+    def linear(encoded: float) -> float:
+        return encoded / 12.92 if encoded <= 0.04045 else ((encoded + 0.055) / 1.055) ** 2.4
 
-def _srgb_to_linear(encoded: float) -> float:
-    return encoded / 12.92 if encoded <= 0.04045 else ((encoded + 0.055) / 1.055) ** 2.4
+    return linear(red), linear(green), linear(blue)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -212,8 +235,8 @@ class RelightOptions(FieldOptions, PortraitOptions):
 
 
 @dataclass(frozen=True)
-class RelightPlan:
-    """The images of each photo; see `plan_relight`.
+class RelightPlan(Job):
+    """The images of each photo.
 
     Attributes:
         options: The options, with defaults that depend on other options filled in.
@@ -234,6 +257,7 @@ class RelightPlan:
     exposures: dict[Path, dict[str, float]] = field(
         default_factory=dict, metadata=NOT_IN_RECIPE, compare=False
     )
+    verb = "relight"
 
     @property
     def photo(self) -> PhotoOptions:
@@ -305,93 +329,3 @@ class RelightPlan:
         shared |= recipe_of_shots(self.shots.all, digest_of)
         lit = [recipe_of(setup, digest_of) | shared for setup in self.setups]
         return [recipe | {"format": name} for recipe in lit for name in self.options.output.formats]
-
-
-def plan_relight(
-    options: RelightOptions, sources: LightSources, output: Path, digest_of: DigestOf = file_sha256
-) -> RelightPlan:
-    """List the images of each photo; raise UsageError for options that exclude each other.
-
-    Args:
-        options: The options that all images share.
-        sources: The lights.
-        output: The output folder, which is not searched for inputs.
-        digest_of: Returns the SHA-256 of a photo whose light is used, or of a network.
-    """
-    photo = replace(options.photo, ocio_config=options.output.config)
-    photo.check()
-    parse_pose(options.pose)
-    parse_lights(options.rig)
-    check_companion(options.matte, "--matte")
-    check_companion(options.normals_from, "--normals-from")
-    background = options.background
-    if background.path is not None and not background.path.is_file():
-        from_behind = any(entry.rpartition("=")[2] == BACKGROUND for entry in sources.light_from or ())
-        if from_behind or is_pattern(str(background.path)):
-            background = background.listed(output)
-    of_light: Kind = "field" if options.reflectance == "portrait" else options.reflectance
-    how = LightOptions(photo=for_other_photos(photo), reflectance=of_light)
-    image_behind = (*background.frames, background.path)[0]
-    lights = photo_lights(sources, how, image_behind, output, digest_of)
-    cached: tuple[CachedMap, ...] = (*drawn_maps(sources, photo.settings.seed), *lights)
-    setups = collect_setups(sources, output, cached)
-    refuse(_rules(options, setups))
-    if options.exposure is None:
-        setups = _at_photos_exposure(setups, lights)
-    face_only, dark = options.is_face_only, background.is_dark
-    sweeps = sources.rotate is not None and is_sweep(sources.rotate)
-    filled = replace(
-        options,
-        photo=photo,
-        background=background,
-        composite="face" if face_only else "photo",
-        exposure="auto" if options.exposure is None else options.exposure,
-        reflectance="field" if face_only and options.reflectance == "portrait" else options.reflectance,
-    )
-    return RelightPlan(
-        filled,
-        tuple(set_ambient(setup, sources.ambient, face_only or dark(setup)) for setup in setups),
-        sources.sampling or ("smooth" if sweeps else "cell"),
-        cached,
-        has_ambient=sources.ambient is not None,
-    )
-
-
-def _rules(options: RelightOptions, setups: Sequence[LightSetup]) -> dict[str, bool]:
-    """Return whether each rule between options is broken, by its message."""
-    baseline, whole = options.reflectance not in _FIELDS, not options.is_face_only
-    of_field = "requires --reflectance portrait or field"
-    of_whole = "requires the whole photo; remove --pose and --composite face"
-    by_photo = [light for setup in setups for light in setup.by_photo]
-    word = ORIGINAL if by_photo and by_photo[0].original else DELIGHT
-    layers = {*_OF_EVERY_IMAGE, *options.aov, *(["wrap"] if options.light_wrap else [])}
-    taken = [name for setup in setups for name in setup.names if name in layers]
-    keeps_background = options.background.kind in ("photo", "none")
-    return {
-        "--pose: turns the head away from its photo; use --composite face": (
-            options.pose is not None and options.composite == "photo"
-        ),
-        f"--network-alone: {of_field}": options.network_alone and baseline,
-        f"--white-balance: {of_field}": options.white_balance != "keep" and baseline,
-        f"--light {word}: {of_field}": bool(by_photo) and baseline,
-        f"--background: {of_whole}": options.background.kind != "photo" and not whole,
-        f"--light {ORIGINAL}: {of_whole}": any(setup.has_original for setup in setups) and not whole,
-        "--normals-from: requires --reflectance portrait and the whole photo": (
-            options.normals_from is not None and (options.reflectance != "portrait" or not whole)
-        ),
-        "--light-wrap: requires a new background; add --background FILE, COLOUR or envmap": (
-            bool(options.light_wrap) and keeps_background
-        ),
-        f"--light: {''.join(taken[:1])} is also a layer of the EXR; rename the light": bool(taken),
-    }
-
-
-def _at_photos_exposure(setups: Sequence[LightSetup], lights: Sequence[PhotoLight]) -> tuple[LightSetup, ...]:
-    """Set the exposure to 0 EV if the lights are as bright as the photo, or as the background image."""
-    behind = {light.envmap for light in lights if light.is_background}
-    return tuple(
-        replace(setup, exposure_ev=0.0)
-        if setup.by_photo or not behind.isdisjoint(light.envmap for light in setup.lights)
-        else setup
-        for setup in setups
-    )

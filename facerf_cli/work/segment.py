@@ -82,18 +82,14 @@ def _overlay(display: np.ndarray, person: Segmentation, face: Face) -> np.ndarra
     """Return a small copy of the photo with class colours and landmarks, scene-linear."""
     step = math.ceil(max(display.shape[:2]) / _OVERLAY_PX)
     image = display[::step, ::step] / np.float32(255) * (1 - _OPACITY * person.matte[::step, ::step, None])
-    for name, colour in zip(CLASSES[1:], _colours(), strict=True):
+    turns = (_HUES[:, None] + np.array([0, 1 / 3, 2 / 3])) * 2 * np.pi
+    colours = np.asarray(0.5 + 0.5 * np.cos(turns), np.float32)  # saturated
+    for name, colour in zip(CLASSES[1:], colours, strict=True):
         image += _OPACITY * person.layer(name)[::step, ::step, None] * colour
     half = max(1, round(_DOT * max(image.shape[:2]) / 2))
     for x, y in np.round(face.landmarks_px / step).astype(int).clip(0):
         image[max(0, y - half) : y + half, max(0, x - half) : x + half] = (0, 1, 0)
     return np.asarray(srgb_to_linear(image.clip(0, 1)))
-
-
-def _colours() -> np.ndarray:
-    """Return a saturated colour [C, 3] for each class of the person."""
-    turns = (_HUES[:, None] + np.array([0, 1 / 3, 2 / 3])) * 2 * np.pi
-    return np.asarray(0.5 + 0.5 * np.cos(turns), np.float32)
 
 
 def _landmarks(face: Face) -> dict[str, Any]:

@@ -26,9 +26,9 @@ from facerf_cli.batch.recipe import DigestOf, Recipe, RecipesOf, key_of
 from facerf_cli.batch.run import keep_newer
 from facerf_cli.batch.settings import BatchOptions, folder_not_file
 from facerf_cli.errors import InputError, UsageError
+from facerf_cli.files.output_options import Format
 from facerf_cli.option import BATCH, option
 from facerf_cli.run.logs import LOGGER_NAME, named
-from facerf_cli.work.output_options import Format
 from facerf_cli.work.photo_options import PhotoOptions, refuse
 
 log = logging.getLogger(LOGGER_NAME)

@@ -14,7 +14,7 @@ from facerf_cli import main
 from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.run import sums_up
 from facerf_cli.batch.settings import BatchOptions, Settings, Shard, default_job_count, torch_device
-from facerf_cli.cli.brief import Verb
+from facerf_cli.cli.help import Verb
 from facerf_cli.cli.options import with_groups
 from facerf_cli.errors import UsageError
 from facerf_cli.run import ray_workers

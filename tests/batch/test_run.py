@@ -19,8 +19,8 @@ from facerf_cli.batch.run import Outcome
 from facerf_cli.batch.settings import NOT_IN_RECIPE
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.files.atomic import atomic_path
+from facerf_cli.files.output_options import OutputOptions
 from facerf_cli.files.texts import file_sha256
-from facerf_cli.work.output_options import OutputOptions
 from facerf_cli.work.photo_options import PhotoOptions
 from tests.batch.toy_batch import Copy, run, run_job
 from tests.folders import rows

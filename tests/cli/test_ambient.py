@@ -14,9 +14,8 @@ from facerf_cli.image.strips import resized
 from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.light import Light
 from facerf_cli.light.over_rig import as_lit, lights_over_rig, with_ambient
-from facerf_cli.light.setups import LightSetup
+from facerf_cli.light.setups import LightSetup, LightSources, collect_setups, set_ambient
 from facerf_cli.main import main
-from facerf_cli.work.light_setups import LightSources, collect_setups, set_ambient
 from facerf_cli.work.relight_options import parse_background
 from tests.astronaut import PATH as PHOTO
 from tests.cli.lines import relight

@@ -7,10 +7,10 @@ import pytest
 from facerf_cli.files.atomic import machine_id
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_exr
+from facerf_cli.light.setups import LightSources, collect_setups
 from facerf_cli.main import main
 from facerf_cli.synth.sky.maps import write_sheet
 from facerf_cli.synth.sky.skies import draw_sky
-from facerf_cli.work.light_setups import LightSources, collect_setups
 from tests.kinds import Said
 
 

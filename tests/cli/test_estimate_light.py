@@ -103,7 +103,8 @@ def test_the_light_of_another_photo_is_that_of_the_two_commands_and_is_kept(
     for name in ("astronaut", "other"):
         (places / f"{name}.json").write_text((given / "astronaut.json").read_text())
     models, landmarks = ["--checkpoint", str(given / "lambert.safetensors")], ["--landmarks", str(places)]
-    relit = [*models, "relight", str(PHOTO), *landmarks, "--lights", "12", "--rotate", "90", "-o"]
+    field = ["--reflectance", "field", "--lights", "12"]
+    relit = [*models, "relight", str(PHOTO), *landmarks, *field, "--rotate", "90", "-o"]
     assert main([*relit, str(tmp_path / "one"), "--light-from", str(other)]) == 0
     assert main([*models, "estimate-light", str(other), *landmarks, "-o", str(tmp_path)]) == 0
     assert main([*relit, str(tmp_path / "two"), "--envmap", str(tmp_path / "other_light.exr")]) == 0

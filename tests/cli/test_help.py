@@ -11,7 +11,7 @@ import pytest
 import typer.main
 
 from facerf_cli.cli import manual
-from facerf_cli.cli.examples import examples_of
+from facerf_cli.cli.help import examples_of
 from facerf_cli.main import app, main
 from tests.kinds import Patch, Said
 

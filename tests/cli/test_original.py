@@ -14,10 +14,10 @@ from facerf_cli.image.colour import SOFT_VIEW, encode_display, linear_to_srgb, l
 from facerf_cli.light.entries import DELIGHT, ORIGINAL, LitImage, lit_images
 from facerf_cli.light.light import Light
 from facerf_cli.light.over_rig import lights_over_rig, with_ambient
+from facerf_cli.light.setups import LightSources, collect_setups, set_ambient
 from facerf_cli.person import Target
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.white import WhiteBalance
-from facerf_cli.work.light_setups import LightSources, collect_setups, set_ambient
 from tests import astronaut
 from tests.astronaut import PATH as PHOTO
 from tests.cli.lines import relight

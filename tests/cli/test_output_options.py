@@ -12,13 +12,13 @@ import pytest
 from PIL import Image
 
 from facerf_cli.errors import UsageError
+from facerf_cli.files.output_options import OutputOptions, check_stdout, parse_formats
 from facerf_cli.files.read import read_image
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.files.write import write_exr
 from facerf_cli.image import colour
 from facerf_cli.main import main
 from facerf_cli.relighting.memory import canvas
-from facerf_cli.work.output_options import OutputOptions, check_stdout, parse_formats
 from tests.astronaut import PATH
 from tests.cli import lines
 from tests.exr_layers import exr_layers

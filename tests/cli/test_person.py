@@ -265,7 +265,7 @@ def test_a_matte_of_the_same_aspect_is_resampled_and_alpha_that_varies_is_one(
     options = PhotoOptions(Settings(), person=save(tmp_path / "wide.png", ellipse(0, 60, 120)))
     refused(InputError, "wide.png: ... 120 x 60 ... 224 x 192", person_matte, item, photo, options)
     options = PhotoOptions(Settings(), person=save(tmp_path / "turned.png", ellipse(0, WIDTH, HEIGHT)))
-    refused(InputError, "turned.png: ... EXIF orientation", person_matte, item, photo, options)
+    refused(InputError, "turned.png: ... upright", person_matte, item, photo, options)
     options = PhotoOptions(Settings(), person=save(tmp_path / "black.png", np.zeros((HEIGHT, WIDTH))))
     refused(InputError, "black.png: ... make it white", person_matte, item, photo, options)
     photo, white = np.zeros((HEIGHT, WIDTH, 3)), np.ones((HEIGHT, WIDTH), np.float32)

@@ -380,7 +380,9 @@ def test_records_of_another_run_stay_out_of_the_dataset(
 
 def test_a_small_capture_is_not_enlarged(given: Given, tmp_path: Path) -> None:
     """Without --crop no stack has more pixels than its face has in the frames, at most 256 a side."""
-    assert main(["prepare-dataset", str(given[0]), "-o", str(tmp_path / "own"), "--checks", "off"]) == 0
+    capture = changed(given, tmp_path / "capture", subjects={"0000": {}})
+    line = ["prepare-dataset", str(capture), "-o", str(tmp_path / "own"), "--checks", "off"]
+    assert main([*line, "--split", "1/0/0"]) == 0
     dataset = read_dataset(tmp_path / "own")
     sides = []
     for subject in dataset.subjects:

@@ -285,7 +285,7 @@ CONFIGURATIONS = {
     "[train]\nschedule = 3": "[train.schedule] is not a table",
     "[relight]\nexpo = 1": "expo: no such command or option; see `facerf relight --help-all`",
     "[relighting]\n": "relighting: no such command or option; see `facerf --help-all`",
-    "global = 3": "global is not a table; write [global]",
+    "global = 3": "global: no such command or option",
     "[global]\nversion = true": "version: no such command or option",
     "[evaluate.olat]\nx = 1": "see `facerf evaluate olat --help-all`",
     "[relight": "not TOML",

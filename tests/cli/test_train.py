@@ -270,13 +270,6 @@ def test_the_portrait_network_trains_on_a_dataset(tmp_path: Path, monkeypatch: P
     assert list(networks) == ["portrait"] and metadata["provenance"]["trained_on"] == "dataset, 1 subjects"
 
 
-def test_help_has_its_options_in_groups(capsys: Said) -> None:
-    assert main(["train", "--help-all"]) == 0
-    text = capsys.readouterr().out
-    places = [text.index(group) for group in ("The run", "Data", "Length", "Losses and ablations", "Speed")]
-    assert places == sorted(places)
-
-
 def test_feature_networks_of_another_scale_are_refused(tmp_path: Path, capsys: Said) -> None:
     dataset = write_joint_dataset(tmp_path / "data")
     line = ["train", "--preset", "tiny", "--dataset", str(dataset.folder), "--steps", "1", "--workers", "0"]

@@ -16,14 +16,15 @@ from skimage.data import astronaut
 
 from facerf_cli.batch.inputs import Item, files_read
 from facerf_cli.batch.settings import BatchOptions, Settings
+from facerf_cli.cli.relight import plan_relight
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_exr
+from facerf_cli.light.setups import LightSources
 from facerf_cli.main import main
 from facerf_cli.work import estimate_light
-from facerf_cli.work.light_setups import LightSources
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.relight import with_background
-from facerf_cli.work.relight_options import RelightOptions, parse_background, plan_relight
+from facerf_cli.work.relight_options import RelightOptions, parse_background
 from facerf_cli.work.sequence import OpenShot, ShotFrames
 from facerf_cli.work.sequence import _made_from as made_from
 from facerf_cli.work.shots import ShotOptions, Shots, VideoOutput, collect_frames, video_rate

@@ -12,9 +12,9 @@ from PIL import Image
 from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.settings import Settings
 from facerf_cli.files.olat_stack import write_olat_stack
+from facerf_cli.files.output_options import parse_exposure
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.main import main
-from facerf_cli.work.output_options import parse_exposure
 from facerf_cli.work.photo_options import PhotoOptions, photo_words
 from facerf_cli.work.view import write_index
 from tests.kinds import Said

@@ -29,6 +29,7 @@ from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.light import Light, far_samples
 from facerf_cli.light.over_rig import lights_over_rig, with_ambient
+from facerf_cli.light.setups import LightSources, collect_setups, set_ambient
 from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, rig_directions
 from facerf_cli.main import main
 from facerf_cli.person import Person
@@ -39,7 +40,6 @@ from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.relighting.relightable import RenderRequest
 from facerf_cli.viewer.page import packed, page
-from facerf_cli.work.light_setups import LightSources, collect_setups, set_ambient
 from facerf_cli.work.view import head_place, of_photo, page_maps
 from tests.viewer.browser import Drawn, chromium, drawn, driven
 

@@ -9,11 +9,11 @@ from typing import Any, Literal
 import numpy as np
 
 from facerf_cli.errors import UsageError
+from facerf_cli.files.output_options import Format, OutputOptions
 from facerf_cli.files.write import write_display, write_exr, write_tiff
 from facerf_cli.image.colour import LINEAR, ColourSpace, View, named_space, named_view
 from facerf_cli.image.strips import Rows
 from facerf_cli.run.logs import step
-from facerf_cli.work.output_options import Format, OutputOptions
 
 
 @dataclass(frozen=True, eq=False)

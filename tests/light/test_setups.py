@@ -1,4 +1,4 @@
-"""What `relight` is asked for: maps, rotations and lamps, and the names of what comes out."""
+"""Light setups: maps, rotations and single lights, and the names of images."""
 
 import math
 import re
@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from facerf_cli.batch.inputs import Item
+from facerf_cli.cli.relight import drawn_maps
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.light_files import LightRecord, write_light
 from facerf_cli.files.write import write_exr
@@ -22,10 +23,9 @@ from facerf_cli.light.over_rig import (
     readable_setups,
     single_lights,
 )
-from facerf_cli.light.setups import LightSetup
+from facerf_cli.light.setups import LightSetup, LightSources, collect_setups, image_path, parse_rotations
 from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, latlong_solid_angles, rig_directions
 from facerf_cli.main import main, repeat_options
-from facerf_cli.work.light_setups import LightSources, collect_setups, drawn_maps, image_path, parse_rotations
 from tests.refusals import refused
 
 HEIGHT_PX = 16
