@@ -32,8 +32,8 @@ from facerf_cli.face.fit import FaceFit, load_fit
 from facerf_cli.face.topology import grid_triangles, on_device
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.network.inputs import MEAN_RADIANCE, Batch, concatenate, resize
-from facerf_cli.raster.camera import crop_camera
-from facerf_cli.raster.texture import UnwrapSettings, unwrap
+from facerf_cli.raster.camera import Camera, crop_camera
+from facerf_cli.raster.texture import UnwrapSettings, point_weights, unwrap
 from facerf_cli.synth.bank.texture_samples import draw_light, draw_target_lights
 
 _LOG_SCALE, _SHIFT = 0.07, (0.1, 0.03)  # standard deviations; shifts right and down in sides of the crop
@@ -330,9 +330,23 @@ def stack_info(path: Path) -> StackInfo:
     )
 
 
-def unwrap_crops(images: Tensor, vertices: Tensor, side: int) -> tuple[Tensor, Tensor]:
-    """Unwrap crops [B, C, S, S] of meshes [B, V, 3]: textures [B, C, T, T], visibility [B, T, T]."""
-    camera = crop_camera(images.shape[-1])
-    depth_px, samples = min(_DEPTH_PX, _DEPTH_PER_PX * camera.width_px), math.ceil(camera.width_px / side)
-    settings = UnwrapSettings(depth_side_px=depth_px, samples=samples, measured=False)
-    return unwrap(images, vertices, on_device(images.device, grid_triangles), camera, side, settings)
+def unwrap_crops(
+    images: Tensor, vertices: Tensor, side: int, weights: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Unwrap crops [B, C, S, S] of meshes [B, V, 3]: textures [B, C, T, T], visibility [B, T, T].
+
+    `weights` are the meshes' `crop_weights`, if they are known.
+    """
+    camera, settings = _unwrapping(images.shape[-1], side)
+    return unwrap(images, vertices, on_device(images.device, grid_triangles), camera, side, settings, weights)
+
+
+def crop_weights(vertices: Tensor, crop_px: int, side: int) -> Tensor:
+    """Return the weights of points of meshes [B, V, 3], most of the work of `unwrap_crops` on a CPU."""
+    camera, settings = _unwrapping(crop_px, side)
+    return point_weights(vertices, on_device(vertices.device, grid_triangles), camera, side, settings)
+
+
+def _unwrapping(crop_px: int, side: int) -> tuple[Camera, UnwrapSettings]:
+    depth_px, samples = min(_DEPTH_PX, _DEPTH_PER_PX * crop_px), math.ceil(crop_px / side)
+    return crop_camera(crop_px), UnwrapSettings(depth_side_px=depth_px, samples=samples, measured=False)

@@ -5,14 +5,22 @@ written. Samples replace the synthetic ones of `synth/bank/texture_samples.py`.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from facerf_cli.dataset.crops import PairReader, StackInfo, pairs_of_split, stack_info, unwrap_crops
+from facerf_cli.capture.stage_json import MOST_CAMERAS
+from facerf_cli.dataset.crops import (
+    PairReader,
+    StackInfo,
+    crop_weights,
+    pairs_of_split,
+    stack_info,
+    unwrap_crops,
+)
 from facerf_cli.dataset.dataset import Dataset, people_of, provenance_of, read_dataset
 from facerf_cli.dataset.pairs import Pair, load_pairs
 from facerf_cli.errors import InputError
@@ -31,6 +39,7 @@ _LEAST_INSIDE = 0.9  # fraction of a texel's pixels that must lie on the face an
 _AROUND_PX = 16  # rows read beyond the face, for texels that cross its border
 _CROP_PER_TEXTURE = 2  # largest side of a crop that is unwrapped, in sides of the texture
 _MEAN_SIDE = 64  # texels along a side of the mean face's shadows
+_WEIGHTS_BYTES = 256 << 20  # of the visibility that is kept, a quarter MB per stack at 128 texels
 
 
 @dataclass(frozen=True)
@@ -41,22 +50,13 @@ class FaceCrops(Batch):
         images: [B, N, 3, S, S], linear.
         seen: [B, 1, S, S] in 0..1, where the crop shows the face.
         vertices: [B, V, 3], fitted meshes in camera space.
+        stacks: [B], a number for each stack of the dataset.
     """
 
     images: Tensor
     seen: Tensor
     vertices: Tensor
-
-    def unwrapped(self, side: int) -> tuple[Tensor, Tensor]:
-        """Return textures [B, N, 3, T, T], 0 where unseen, and visibility [B, 1, T, T].
-
-        A texel is unseen if too few of its pixels lie on the face.
-        """
-        planes = torch.cat([self.images.flatten(1, 2).float(), self.seen], 1)
-        textures, visible = unwrap_crops(planes, self.vertices, side)
-        inside = textures[:, -1:] > _LEAST_INSIDE
-        textures = (textures[:, :-1] * inside).view(*self.images.shape[:3], side, side)
-        return textures, visible[:, None] * inside
+    stacks: Tensor
 
 
 @dataclass(frozen=True)
@@ -80,11 +80,6 @@ class LitCrops(Batch):
     lights_head: Tensor
     heads: Tensor
 
-    def unwrapped(self, side: int) -> LightTextures:
-        """Unwrap the faces to textures of a side."""
-        textures, _ = self.crops.unwrapped(side)
-        return LightTextures(recoloured(textures, self.colours[:, None]), self.lights_head, self.heads)
-
 
 @dataclass(frozen=True)
 class SampleCrops(Batch):
@@ -106,23 +101,6 @@ class SampleCrops(Batch):
     colours: Tensor
     response: CameraResponse
 
-    def unwrapped(self, side: int) -> Sample:
-        """Unwrap the faces to textures of a side, with the sources as their cameras would see them."""
-        source, visible = self.source.unwrapped(side)
-        target, target_visible = self.target.unwrapped(side)
-        photo = self.response.apply(recoloured(source, self.colours[:, None])[:, 0], visible)
-        normals = normal_map(self.source.vertices, on_device(photo.device, grid_triangles), side)
-        return Sample(
-            source=inpaint(photo, visible[:, 0]),
-            visible=visible,
-            normals_source=normals,
-            # the source's normals, rotated, like in `Field.olats`
-            normals_target=torch.einsum("bdc,bcij->bdij", self.turn, normals),
-            lights=self.lights,
-            target=recoloured(target, self.colours[:, None]),
-            weight=target_visible * (0.3 + 0.7 * visible),
-        )
-
 
 @dataclass(frozen=True, eq=False)
 class DatasetFaces:
@@ -136,6 +114,7 @@ class DatasetFaces:
     fewest_lights: int  # that a subject has
     rig_lights: int  # of the mean face's shadows
     provenance: dict[str, Any]
+    weights: dict[int, Tensor] = field(default_factory=dict)  # `crop_weights` of stacks, by their numbers
 
     def heads(self, held_out: int) -> tuple[Tensor, Tensor]:
         """Return heads of the split train, and at most `held_out` of the split validation."""
@@ -191,8 +170,8 @@ class DatasetFaces:
         colours = camera_matrix(generator)
         exposure = MEAN_RADIANCE / (colours @ source_info.lit_colour).mean()
         return SampleCrops(
-            source=self._crops(source_info, source[None]),
-            target=self._crops(info, _read_face(path, info, chosen.tolist())),
+            source=self._crops(pair.subject, pair.source_camera, source[None]),
+            target=self._crops(pair.subject, pair.target_camera, _read_face(path, info, chosen.tolist())),
             turn=(info.rotation @ source_info.rotation.T)[None],
             lights=info.directions[chosen][None],
             colours=(exposure * colours)[None],
@@ -207,17 +186,65 @@ class DatasetFaces:
         path = self.dataset.stack_path(subject, camera)
         info = stack_info(path)
         chosen = draw_target_lights(info.directions, min(lights, self.fewest_lights), generator).tolist()
-        crops = self._crops(info, _read_face(path, info, chosen))
+        crops = self._crops(subject, camera, _read_face(path, info, chosen))
         colours = camera_matrix(generator) * (MEAN_RADIANCE / info.lit_mean)
         directions = info.directions[chosen] @ info.rotation  # R^T w, of row vectors
         return LitCrops(crops, colours[None], directions[None], head)
 
-    def _crops(self, info: StackInfo, images: Tensor) -> FaceCrops:
+    def _crops(self, subject: str, camera: str, images: Tensor) -> FaceCrops:
         """Resample images [N, 3, H, W] of a stack to the side that is unwrapped."""
+        info = stack_info(self.dataset.stack_path(subject, camera))
         if info.side_px != self.crop_px:
             images = resize(images.float(), self.crop_px)
         seen = resize(info.face[None, None].float(), self.crop_px)
-        return FaceCrops(images[None], seen, info.fit.vertices_camera(self.model)[None])
+        place = self.dataset.subjects.index(subject), self.dataset.cameras[subject].index(camera)
+        number = torch.tensor([place[0] * MOST_CAMERAS + place[1]])
+        return FaceCrops(images[None], seen, info.fit.vertices_camera(self.model)[None], number)
+
+    def sample(self, crops: SampleCrops) -> Sample:
+        """Unwrap the faces of a sample, with the sources as their cameras would see them."""
+        source, visible = self.unwrapped(crops.source)
+        target, target_visible = self.unwrapped(crops.target)
+        photo = crops.response.apply(recoloured(source, crops.colours[:, None])[:, 0], visible)
+        normals = normal_map(crops.source.vertices, on_device(photo.device, grid_triangles), self.side)
+        return Sample(
+            source=inpaint(photo, visible[:, 0]),
+            visible=visible,
+            normals_source=normals,
+            # the source's normals, rotated, like in `Field.olats`
+            normals_target=torch.einsum("bdc,bcij->bdij", crops.turn, normals),
+            lights=crops.lights,
+            target=recoloured(target, crops.colours[:, None]),
+            weight=target_visible * (0.3 + 0.7 * visible),
+        )
+
+    def light_textures(self, lit: LitCrops) -> LightTextures:
+        """Unwrap faces under single lights."""
+        textures, _ = self.unwrapped(lit.crops)
+        return LightTextures(recoloured(textures, lit.colours[:, None]), lit.lights_head, lit.heads)
+
+    def unwrapped(self, crops: FaceCrops) -> tuple[Tensor, Tensor]:
+        """Return textures [B, N, 3, T, T] of crops, 0 where unseen, and visibility [B, 1, T, T].
+
+        A texel is unseen if too few of its pixels lie on the face.
+        """
+        planes = torch.cat([crops.images.flatten(1, 2).float(), crops.seen], 1)
+        textures, visible = unwrap_crops(planes, crops.vertices, self.side, self._weights_of(crops))
+        inside = textures[:, -1:] > _LEAST_INSIDE
+        textures = (textures[:, :-1] * inside).view(*crops.images.shape[:3], self.side, self.side)
+        return textures, visible[:, None] * inside
+
+    def _weights_of(self, crops: FaceCrops) -> Tensor:
+        """Return `crop_weights` of crops; computed once for the stacks that fit into `_WEIGHTS_BYTES`."""
+        numbers = crops.stacks.tolist()
+        missing = [place for place, number in enumerate(numbers) if number not in self.weights]
+        weights = {}
+        if missing:
+            made = crop_weights(crops.vertices[missing], self.crop_px, self.side)
+            weights = dict(zip((numbers[place] for place in missing), made, strict=True))
+            if len(self.weights) * made[0].nbytes < _WEIGHTS_BYTES:
+                self.weights.update(weights)
+        return torch.stack([weights[n] if n in weights else self.weights[n] for n in numbers])
 
 
 def _read_face(path: Path, info: StackInfo, lights: Sequence[int]) -> Tensor:

@@ -100,6 +100,7 @@ def unwrap(
     camera: Camera,
     texture_side: int,
     settings: UnwrapSettings = UnwrapSettings(),
+    weight: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Unwrap an image to a uniform grid mesh's texture [..., C, T, T] and its visibility [..., T, T].
 
@@ -115,6 +116,8 @@ def unwrap(
         camera: The image's camera.
         texture_side: T.
         settings: Samples per texel and limits of visibility.
+        weight: `point_weights` of the mesh, if they are known already; only for settings that are not
+            `measured`.
     """
     if image.shape[-2:] != (camera.height_px, camera.width_px):
         raise ValueError(
@@ -123,16 +126,29 @@ def unwrap(
     samples = settings.samples
     if settings.measured:
         image, camera, samples = _match_scale(image, vertices_camera, camera, texture_side, samples)
-    side = math.isqrt(vertices_camera.shape[-2])
-    points = bake_attributes(vertices_camera, side, texture_side * samples).movedim(-3, -1)
-    with torch.no_grad():
-        weight = _visibility(points, vertices_camera, triangles, camera, settings)
+    points = _points(vertices_camera, texture_side * samples)
+    if weight is None:
+        with torch.no_grad():
+            weight = _visibility(points, vertices_camera, triangles, camera, settings)
     uv = torch.stack(_shares(project(points, camera), camera), -1)
     colour = sample_texture(image, uv).movedim(-1, -3)
     weight = weight.to(image.dtype).unsqueeze(-3)
     visible = F.avg_pool2d(weight, samples)
     texture = F.avg_pool2d(colour * weight, samples) / visible.clamp(min=_TINY)
     return texture, visible.squeeze(-3)
+
+
+@torch.no_grad()
+def point_weights(
+    vertices_camera: Tensor, triangles: Tensor, camera: Camera, texture_side: int, settings: UnwrapSettings
+) -> Tensor:
+    """Return the weights [..., T samples, T samples] of the points that `unwrap` averages."""
+    points = _points(vertices_camera, texture_side * settings.samples)
+    return _visibility(points, vertices_camera, triangles, camera, settings)
+
+
+def _points(vertices_camera: Tensor, side: int) -> Tensor:
+    return bake_attributes(vertices_camera, math.isqrt(vertices_camera.shape[-2]), side).movedim(-3, -1)
 
 
 def _shares(px: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:

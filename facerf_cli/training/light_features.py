@@ -56,7 +56,7 @@ class LightFeaturesObjective(HeadsObjective):
         return LightTextures(sample.target * seen[:, None], lights_head, head)
 
     def _unwrapped(self, batch: LightTextures | LitCrops) -> LightTextures:
-        return batch.unwrapped(self.source.side) if isinstance(batch, LitCrops) else batch
+        return self.source.light_textures(batch) if isinstance(batch, LitCrops) else batch
 
     def forward(self, batch: LightTextures | LitCrops) -> dict[str, Tensor]:
         """Compute the term `light`, a mean over faces and lights."""

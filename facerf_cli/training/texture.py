@@ -84,7 +84,7 @@ class SamplesObjective(HeadsObjective):
 
     def textures(self, sample: Sample | SampleCrops) -> Sample:
         """Unwrap the crops of a dataset; samples of baked heads are textures already."""
-        return sample.unwrapped(self.source.side) if isinstance(sample, SampleCrops) else sample
+        return self.source.sample(sample) if isinstance(sample, SampleCrops) else sample
 
 
 @dataclass(frozen=True)

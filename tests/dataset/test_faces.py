@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 
 from facerf_cli.dataset.crops import stack_info
 from facerf_cli.dataset.dataset import Dataset, read_dataset
@@ -54,7 +55,7 @@ def draw(faces: DatasetFaces, head: int, seed: int = 0, lights: int = 3) -> Samp
 
 
 def sample_of(faces: DatasetFaces, seed: int = 0) -> Sample:
-    return concatenate([draw(faces, head, seed) for head in range(3)]).unwrapped(SIDE)
+    return faces.sample(concatenate([draw(faces, head, seed) for head in range(3)]))
 
 
 def pair_of(camera: str, target: str, light: int) -> Pair:
@@ -69,7 +70,7 @@ def test_a_sample_is_the_unwrapped_stack(faces: DatasetFaces) -> None:
     fit = load_fit(dataset.fit_path("0001", "C1"))
     vertices = fit.vertices_camera(faces.model)
     wanted, visible = unwrap(stack.olats[17].float(), vertices, grid_triangles(), fit.camera, SIDE)
-    sample = crops.unwrapped(SIDE)
+    sample = faces.sample(crops)
     found = torch.linalg.solve(crops.colours[0], sample.target[0, 0].flatten(1)).view(3, SIDE, SIDE)
     seen = (sample.weight[0, 0] > 0.9) & (visible > 0.9)
     assert seen.float().mean() > 0.2
@@ -153,9 +154,20 @@ def test_crops_are_resized_to_twice_the_texture_at_most(faces: DatasetFaces) -> 
     small = open_faces(faces.dataset.folder, "builtin", 16, LIGHTS)
     crops = draw(small, 0)
     assert crops.source.images.shape[-1] == crops.target.seen.shape[-1] == 32
-    whole, half = draw(faces, 0).target.unwrapped(16)[0], crops.target.unwrapped(16)[0]
+    fine = open_faces(faces.dataset.folder, "builtin", SIDE, LIGHTS)
+    whole = F.avg_pool2d(fine.unwrapped(draw(fine, 0).target)[0][0], 2)
+    half = small.unwrapped(crops.target)[0][0]
     both = (whole > 0) & (half > 0)
     assert both.float().mean() > 0.1 and (whole - half)[both].abs().mean() < 0.05 * whole[both].mean()
+
+
+def test_textures_do_not_depend_on_what_was_unwrapped_before(faces: DatasetFaces) -> None:
+    fresh = open_faces(faces.dataset.folder, "builtin", SIDE, LIGHTS)
+    parts = [draw(fresh, head).target for head in range(3)]
+    expected = [fresh.unwrapped(part)[0] for part in parts]
+    fresh.weights.pop(next(iter(fresh.weights)))
+    mixed, _ = fresh.unwrapped(concatenate([*parts, *parts]))  # one stack is unknown again, and twice there
+    torch.testing.assert_close(mixed, torch.cat([*expected, *expected]))
 
 
 def test_training_on_a_dataset_lowers_the_loss_and_names_it(faces: DatasetFaces, tmp_path: Path) -> None:

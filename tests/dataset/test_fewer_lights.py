@@ -94,7 +94,7 @@ def test_they_train_beside_those_who_have_all(dataset: Dataset, tmp_path: Path) 
     write_pairs(here, draw_pairs(here, MAPS, 2, 0), overwrite=False)
     for faces in (free, open_faces(here.folder, "builtin", 32)):
         drawn = [faces.draw(torch.tensor([head]), LIGHTS, seeded(head)) for head in range(3)]
-        sample = concatenate(drawn).unwrapped(32)
+        sample = faces.sample(concatenate(drawn))
         assert sample.target.shape[:2] == (3, 17) and sample.source.isfinite().all()
     reader = open_pairs(here, "train", 48)
     assert all(batch.target.isfinite().all() for batch in reader.read(reader.pairs))

@@ -74,7 +74,7 @@ def test_the_crops_of_a_stack_give_its_textures(tmp_path: Path) -> None:
     dataset = write_small_dataset(tmp_path, lights=20, crop_px=48)
     faces, subject = open_faces(dataset.folder, "builtin", 32), dataset.subjects[0]
     batch = faces.draw_lights(torch.tensor([0]), 5, torch.Generator().manual_seed(2))
-    found = batch.unwrapped(32)
+    found = faces.light_textures(batch)
     errors, colours = [], batch.colours[0].diagonal()  # of a camera that sees colours
     for camera in dataset.cameras[subject]:
         path = dataset.stack_path(subject, camera)
