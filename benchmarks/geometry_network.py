@@ -96,7 +96,7 @@ def of_photos(paths: list[Path]) -> tuple[Tensor, Tensor]:
 
 def held_out(network: GeometryNetwork, folder: Path, count: int, draws: int) -> tuple[Tensor, Tensor]:
     """Print the errors on held-out heads of a bank; their crops, and their landmarks with noise."""
-    settings = GeometryObjectiveSettings(held_out_heads=count, held_out_draws=draws)
+    settings = GeometryObjectiveSettings(held_out_people=count, held_out_draws=draws)
     backgrounds = load_file(folder.parent / "backgrounds.safetensors")["backgrounds"]
     objective = GeometryObjective(RenderedFaces(folder, backgrounds, {}), network, settings)
     metrics = objective.validate().metrics

@@ -44,12 +44,10 @@ def main() -> None:
     sample_s = per_step(lambda step: faces.draw_shared(LIGHTS, generator_of(step), 0, step), given.steps)
     print_row(f"reflectance: reading a sample of {LIGHTS} lights", sample_s)
     sample = faces.draw_shared(LIGHTS, generator_of(0), 0, 0)[1]
-    print_row(
-        "reflectance: unwrapping it in the step", per_step(lambda step: faces.sample(sample), FACES)
-    )
-    heads = faces.heads(1)[0]
-    drawn = [faces.draw_lights(heads[:1], LIGHTS, seeded(0, face)) for face in range(FACES)]
-    face_s = per_step(lambda step: faces.draw_lights(heads[:1], LIGHTS, seeded(step)), FACES)
+    print_row("reflectance: unwrapping it in the step", per_step(lambda step: faces.sample(sample), FACES))
+    people = faces.people(1)[0]
+    drawn = [faces.draw_lights(people[:1], LIGHTS, seeded(0, face)) for face in range(FACES)]
+    face_s = per_step(lambda step: faces.draw_lights(people[:1], LIGHTS, seeded(step)), FACES)
     print_row(f"light-features: reading a step of {FACES} faces x {LIGHTS} lights", FACES * face_s)
     unwrapping_s = per_step(lambda step: faces.light_textures(drawn[step]), FACES)
     print_row("light-features: unwrapping it in the step", FACES * unwrapping_s)

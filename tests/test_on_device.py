@@ -31,7 +31,7 @@ from facerf_cli.training.light_features import LightFeaturesObjective
 from facerf_cli.training.objective import Objective, seeded
 from facerf_cli.training.parsing import ParsingObjective
 from facerf_cli.training.portrait import PortraitObjective
-from facerf_cli.training.texture import HeadsSettings, TextureObjective, TextureObjectiveSettings
+from facerf_cli.training.texture import PeopleSettings, TextureObjective, TextureObjectiveSettings
 from tests import fake_device
 from tests.synth.conftest import bank, bank_folder
 from tests.training import toy_parsing, toy_portrait
@@ -57,19 +57,19 @@ def test_relighting_mixes_no_devices() -> None:
 
 
 def reflectance(bank: Bank) -> Objective:
-    settings = TextureObjectiveSettings(lights=3, held_out_heads=2, held_out_draws=1)
+    settings = TextureObjectiveSettings(lights=3, held_out_people=2, held_out_draws=1)
     network = DefaultReflectanceSettings(32, (8, 12, 16), (8, 12, 16), template_channels=2, rig_lights=20)
     return TextureObjective(bank, DefaultReflectanceNetwork(network), None, settings)
 
 
 def light_features(bank: Bank) -> Objective:
-    settings = HeadsSettings(lights=4, held_out_heads=2, held_out_draws=1)
+    settings = PeopleSettings(lights=4, held_out_people=2, held_out_draws=1)
     return LightFeaturesObjective(bank, LightNetwork(LightSettings(1 / 8, 4, 32)), settings)
 
 
 def diffuse_sh(bank: Bank) -> Objective:
     network = DiffuseNetwork(DiffuseSettings(32, (8, 12, 16), (8, 12, 16), 4, 4, 16))
-    return DiffuseObjective(bank, network, SumSettings(lights=4, sums=2, held_out_heads=2, held_out_draws=2))
+    return DiffuseObjective(bank, network, SumSettings(lights=4, sums=2, held_out_people=2, held_out_draws=2))
 
 
 def parsing(bank: Bank) -> Objective:

@@ -26,15 +26,15 @@ class ToyFaces:
     side: int = SIDE
     provenance: dict[str, Any] = field(default_factory=lambda: {"heads": "toys", "licence": "MIT"})
 
-    def heads(self, held_out: int) -> tuple[Tensor, Tensor]:
+    def people(self, held_out: int) -> tuple[Tensor, Tensor]:
         return torch.arange(held_out, 40), torch.arange(held_out)
 
     def mean_face(self) -> tuple[Tensor, Tensor, Tensor]:
         directions = F.normalize(torch.randn(RIG, 3, generator=torch.Generator().manual_seed(0)), dim=1)
         return _normals(), torch.ones(RIG, SIDE, SIDE), directions
 
-    def draw(self, heads: Tensor, lights: int, generator: torch.Generator) -> Sample:
-        faces = len(heads)
+    def draw(self, people: Tensor, lights: int, generator: torch.Generator) -> Sample:
+        faces = len(people)
         normals = _normals().expand(faces, 3, SIDE, SIDE).contiguous()
         directions = torch.randn(faces, lights, 3, generator=generator)
         directions = F.normalize(directions + torch.tensor([0.0, 0, 1]), dim=-1)
@@ -42,7 +42,7 @@ class ToyFaces:
         albedo = albedo * (0.5 + torch.rand(faces, 3, SIDE, SIDE, generator=generator))
         shading = torch.einsum("blc,bcij->blij", directions, normals).clamp_min(0)
         target = albedo[:, None] * shading[:, :, None]
-        target[heads == self.poison] = torch.nan
+        target[people == self.poison] = torch.nan
         seen = torch.ones(faces, 1, SIDE, SIDE)
         source = albedo / albedo.mean((1, 2, 3), keepdim=True) * MEAN_RADIANCE
         return Sample(source, seen, normals, normals, directions, target, seen)
@@ -57,5 +57,5 @@ def _normals() -> Tensor:
 def toy_objective(poison: int = -1) -> TextureObjective:
     """The same weights at every call."""
     torch.manual_seed(0)
-    settings = TextureObjectiveSettings(lights=2, held_out_heads=3, held_out_draws=1, held_out_lights=2)
+    settings = TextureObjectiveSettings(lights=2, held_out_people=3, held_out_draws=1, held_out_lights=2)
     return TextureObjective(ToyFaces(poison), DefaultReflectanceNetwork(NETWORK), settings=settings)

@@ -63,12 +63,12 @@ class FaceCrops(Batch):
 class LightTextures(Batch):
     """B faces under L single lights: textures [B, L, 3, T, T] linear, zero where unseen; lights [B, L, 3].
 
-    The lights are unit vectors in the head's frame; `heads` [B] are the heads' indices.
+    The lights are unit vectors in the head's frame; `people` [B] are their indices.
     """
 
     textures: Tensor
     lights_head: Tensor
-    heads: Tensor
+    people: Tensor
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class LitCrops(Batch):
     crops: FaceCrops
     colours: Tensor
     lights_head: Tensor
-    heads: Tensor
+    people: Tensor
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class SampleCrops(Batch):
 
 @dataclass(frozen=True, eq=False)
 class DatasetFaces:
-    """Faces of a prepared dataset, for textures of `side` texels; heads are indices of `dataset.subjects`."""
+    """Faces of a dataset, for textures of `side` texels; people are indices of `dataset.subjects`."""
 
     dataset: Dataset
     model: MorphableModel
@@ -116,8 +116,8 @@ class DatasetFaces:
     provenance: dict[str, Any]
     weights: dict[int, Tensor] = field(default_factory=dict)  # `crop_weights` of stacks, by their numbers
 
-    def heads(self, held_out: int) -> tuple[Tensor, Tensor]:
-        """Return heads of the split train, and at most `held_out` of the split validation."""
+    def people(self, held_out: int) -> tuple[Tensor, Tensor]:
+        """Return people of the split train, and at most `held_out` of the split validation."""
         train, validation = (
             torch.tensor([self.dataset.subjects.index(subject) for subject in people_of(self.dataset, split)])
             for split in ("train", "validation")
@@ -136,17 +136,17 @@ class DatasetFaces:
     def draw_shared(
         self, lights: int, generator_of: Callable[..., torch.Generator], index: int, step: int
     ) -> tuple[Tensor, SampleCrops]:
-        """Draw a training sample with `lights` target lights, and its head [1].
+        """Draw a training sample with `lights` target lights, and its person [1].
 
         See `PairReader.draw_source`.
         """
         pair, source = self.train.draw_source(generator_of, index, step)
-        head = torch.tensor([self.dataset.subjects.index(pair.subject)])
-        return head, self._sample(pair, source, lights, generator_of(index))
+        person = torch.tensor([self.dataset.subjects.index(pair.subject)])
+        return person, self._sample(pair, source, lights, generator_of(index))
 
-    def draw(self, head: Tensor, lights: int, generator: torch.Generator) -> SampleCrops:
-        """Draw a sample of a head [1]; its stack is opened for this sample only."""
-        subject = self.dataset.subjects[int(head)]
+    def draw(self, people: Tensor, lights: int, generator: torch.Generator) -> SampleCrops:
+        """Draw a sample of a person [1]; the stack is opened for this sample only."""
+        subject = self.dataset.subjects[int(people)]
         pairs = load_pairs(self.dataset).get(subject, ([],))[0]
         reader = PairReader(self.dataset, (subject,), pairs, self.crop_px)
         seed = int(torch.randint(1 << 31, (), generator=generator))
@@ -178,9 +178,9 @@ class DatasetFaces:
             response=CameraResponse.draw(1, self.side, generator),
         )
 
-    def draw_lights(self, head: Tensor, lights: int, generator: torch.Generator) -> LitCrops:
-        """Draw a head [1] under random lights of one of its cameras, by a camera of random colours."""
-        subject = self.dataset.subjects[int(head)]
+    def draw_lights(self, people: Tensor, lights: int, generator: torch.Generator) -> LitCrops:
+        """Draw a person [1] under random lights of one of its cameras, by a camera of random colours."""
+        subject = self.dataset.subjects[int(people)]
         cameras = self.dataset.cameras[subject]
         camera = cameras[int(torch.randint(len(cameras), (), generator=generator))]
         path = self.dataset.stack_path(subject, camera)
@@ -189,7 +189,7 @@ class DatasetFaces:
         crops = self._crops(subject, camera, _read_face(path, info, chosen))
         colours = camera_matrix(generator) * (MEAN_RADIANCE / info.lit_mean)
         directions = info.directions[chosen] @ info.rotation  # R^T w, of row vectors
-        return LitCrops(crops, colours[None], directions[None], head)
+        return LitCrops(crops, colours[None], directions[None], people)
 
     def _crops(self, subject: str, camera: str, images: Tensor) -> FaceCrops:
         """Resample images [N, 3, H, W] of a stack to the side that is unwrapped."""
@@ -221,7 +221,7 @@ class DatasetFaces:
     def light_textures(self, lit: LitCrops) -> LightTextures:
         """Unwrap faces under single lights."""
         textures, _ = self.unwrapped(lit.crops)
-        return LightTextures(recoloured(textures, lit.colours[:, None]), lit.lights_head, lit.heads)
+        return LightTextures(recoloured(textures, lit.colours[:, None]), lit.lights_head, lit.people)
 
     def unwrapped(self, crops: FaceCrops) -> tuple[Tensor, Tensor]:
         """Return textures [B, N, 3, T, T] of crops, 0 where unseen, and visibility [B, 1, T, T].

@@ -18,11 +18,11 @@ from facerf_cli.light.sphere import RigLight
 from facerf_cli.network.diffuse_sh import ORDER, DiffuseEstimate, DiffuseNetwork, shading
 from facerf_cli.network.inputs import Batch, to_root
 from facerf_cli.synth.bank.texture_samples import Sample, SampleSource
-from facerf_cli.training.build import Run
 from facerf_cli.training.losses import clipped_si_mse, root_loss
 from facerf_cli.training.objective import Objective, Validation, metrics_by_pose
+from facerf_cli.training.run import Run
 from facerf_cli.training.sheets import tiled
-from facerf_cli.training.texture import HeadsSettings, SamplesObjective
+from facerf_cli.training.texture import PeopleSettings, SamplesObjective
 
 _SHEET_FACES = 5
 _TOTAL = 1.5  # of a sum's weights: a face lit from the front then has about the albedo's radiance
@@ -31,7 +31,7 @@ _TINT = 0.15  # standard deviation of the logarithm of a light's colour
 
 
 @dataclass(frozen=True)
-class SumSettings(HeadsSettings):
+class SumSettings(PeopleSettings):
     """Settings of the stage, with the sums of a face and step."""
 
     sums: int = 3
@@ -44,7 +44,7 @@ class DiffuseBatch(Batch):
     sample: Sample | SampleCrops
     weights: Tensor
     coefficients: Tensor  # in camera space
-    heads: Tensor  # [B] indices
+    people: Tensor  # [B] indices
 
 
 class DiffuseObjective(SamplesObjective):
@@ -63,12 +63,12 @@ class DiffuseObjective(SamplesObjective):
         super().__init__("diffuse_sh", network, source, settings)
 
     def batch_of(
-        self, sample: Sample | SampleCrops, head: Tensor, generator: torch.Generator
+        self, sample: Sample | SampleCrops, people: Tensor, generator: torch.Generator
     ) -> DiffuseBatch:
         """Draw random sums of the single lights of a sample."""
         weights = draw_sums(self.settings.sums, sample.lights.shape[1], generator)
         coefficients = [rig_coefficients(RigLight(sample.lights[0], w), ORDER) for w in weights]
-        return DiffuseBatch(sample, weights[None], torch.stack(coefficients)[None], head)
+        return DiffuseBatch(sample, weights[None], torch.stack(coefficients)[None], people)
 
     def forward(self, batch: DiffuseBatch) -> dict[str, Tensor]:
         """Compute `source`, which trains only the light, and `targets`, which train the albedo.
@@ -90,7 +90,7 @@ class DiffuseObjective(SamplesObjective):
 
     @torch.no_grad()
     def validate(self) -> Validation:
-        """Measure the mean Si-MSE of held-out heads, clipped at white: of targets, by pose, and of sources.
+        """Measure the mean Si-MSE of held-out people, clipped at white: of targets, by pose, and of sources.
 
         The sheet has two rows per face: source and targets; predicted source and targets, albedo and shading.
         """
@@ -151,6 +151,6 @@ def _sheet_rows(sample: Sample, estimate: DiffuseEstimate, own: Tensor, relit: T
 
 def build(run: Run) -> Objective:
     """Make the objective of the stage."""
-    settings = SumSettings(held_out_heads=run.sizes.held_out_heads)
+    settings = SumSettings(held_out_people=run.sizes.held_out_people)
     objective: Objective = run.objective(DiffuseObjective)(run.faces(), run.network("diffuse_sh"), settings)
     return objective

@@ -19,8 +19,8 @@ from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, Geome
 from facerf_cli.network.inputs import concatenate
 from facerf_cli.raster.camera import crop_camera, project
 from facerf_cli.synth.bank.face_crops import FaceCrops, RenderedFaces
-from facerf_cli.training.build import Run
-from facerf_cli.training.objective import Objective, Validation
+from facerf_cli.training.objective import Objective, PeopleObjective, Validation
+from facerf_cli.training.run import Run
 from facerf_cli.training.sheets import FOUND_COLOUR, TRUE_COLOUR, in_rows, mark, tiled
 
 _SHEET_ROWS, _SHEET_COLUMNS, _SHEET_PX = 4, 8, 192
@@ -28,18 +28,18 @@ _SHEET_ROWS, _SHEET_COLUMNS, _SHEET_PX = 4, 8, 192
 
 @dataclass(frozen=True)
 class GeometryObjectiveSettings:
-    """Weights of the terms, and the held-out heads and draws of each for validation."""
+    """Weights of the terms, and the held-out people and draws of each for validation."""
 
     landmarks: float = 10.0  # of distances in inter-ocular distances
     contour: float = 0.5  # of a contour landmark, relative to the others
     rotation: float = 2.0  # of the chord between rotations
     depth: float = 2.0  # of the ratio of depths
     coefficients: float = 0.08  # of squared differences, in units of the fit's priors
-    held_out_heads: int = 12
+    held_out_people: int = 12
     held_out_draws: int = 16
 
 
-class GeometryObjective(Objective):
+class GeometryObjective(PeopleObjective):
     """Errors of landmarks, pose and coefficients on rendered faces."""
 
     chooses_by, validation_seed = "landmarks_percent", 20211
@@ -56,11 +56,8 @@ class GeometryObjective(Objective):
         network = network or GeometryNetwork(
             GeometryNetworkSettings(mean_translation_m=faces.mean_translation_m())
         )
-        super().__init__({"geometry": network}, faces.provenance)
-        self.faces = faces
+        super().__init__("geometry", network, faces, settings)
         self.side = network.side
-        self.settings = settings
-        self.heads, self.held_out = faces.heads(settings.held_out_heads)
         model = load_face_model()
         own = network.settings
         points = [model.landmarks(x) for x in (model.mean[None], model.identity, model.expression)]
@@ -68,13 +65,9 @@ class GeometryObjective(Objective):
         self.register_buffer("identity_m", points[1][: own.identity])
         self.register_buffer("expression_m", points[2][: own.expression])
 
-    def draw_one(self, generator: torch.Generator) -> FaceCrops:
-        """Draw a crop of a random head."""
-        head = int(self.heads[torch.randint(len(self.heads), (), generator=generator)])
-        return self.faces.draw(head, self.side, generator)
-
-    def draw_held_out(self, person: int, generator: torch.Generator) -> FaceCrops:
-        return self.faces.draw(person, self.side, generator)
+    def draw_person(self, person: int, generator: torch.Generator) -> FaceCrops:
+        crops: FaceCrops = self.source.draw(person, self.side, generator)
+        return crops
 
     def forward(self, batch: FaceCrops) -> dict[str, Tensor]:
         """Compute the weighted terms, each a mean over faces."""
@@ -123,7 +116,7 @@ class GeometryObjective(Objective):
 
     @torch.no_grad()
     def validate(self) -> Validation:
-        """Measure mean errors on held-out heads; landmarks in percent of the inter-ocular distance."""
+        """Measure mean errors on held-out people; landmarks in percent of the inter-ocular distance."""
         batch = concatenate(self.held_out_samples()).to(self.device)
         estimate = self.estimate(batch.crops)
         distance_px = (self.landmarks_px(estimate, self.side) - batch.landmarks_px).norm(dim=-1)
@@ -155,10 +148,10 @@ class GeometryObjective(Objective):
 
 def build(run: Run) -> Objective:
     """Make the objective of the stage; bake synthetic people that are missing."""
-    held_out = run.sizes.held_out_heads
+    held_out = run.sizes.held_out_people
     folder, provenance = run.bake_people(held_out, with_squares=False)
     faces = RenderedFaces(folder, run.backgrounds(run.bank), provenance)
-    settings = GeometryObjectiveSettings(held_out_heads=held_out)
+    settings = GeometryObjectiveSettings(held_out_people=held_out)
     network = run.geometry(faces.mean_translation_m())
     objective: Objective = run.objective(GeometryObjective)(faces, network, settings)
     return objective

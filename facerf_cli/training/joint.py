@@ -48,7 +48,6 @@ from facerf_cli.network.vgg import VGG16_LICENCE, load_vgg
 from facerf_cli.raster.camera import Camera, crop_camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import inpaint, normal_map, sample_texture
-from facerf_cli.training.build import Run
 from facerf_cli.training.losses import (
     Features,
     MaskedPair,
@@ -64,6 +63,7 @@ from facerf_cli.training.losses import (
 )
 from facerf_cli.training.objective import Objective, Validation, seeded
 from facerf_cli.training.processes import broadcast_from_first, process_rank
+from facerf_cli.training.run import Run
 from facerf_cli.training.sheets import tiled
 
 FIXED_LANDMARKS = tuple(i for i in range(len(CONTOUR), 68) if i not in INNER_MOUTH_CORNERS)

@@ -21,17 +21,17 @@ from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.network.features import AppearanceNetwork, LightNetwork
 from facerf_cli.network.inputs import concatenate, head_rotation, resize
 from facerf_cli.synth.bank.texture_samples import SampleSource
-from facerf_cli.training.build import Run
-from facerf_cli.training.objective import Objective, Validation
+from facerf_cli.training.objective import Objective, PeopleObjective, Validation
+from facerf_cli.training.run import Run
 from facerf_cli.training.sheets import tiled
-from facerf_cli.training.texture import HeadsObjective, HeadsSettings
+from facerf_cli.training.texture import PeopleSettings
 
 _NORMALS_SIDE = 64  # texels along a side of the normals that head rotations are computed from
 _SHEET_FACES, _CPU = 6, torch.device("cpu")
-_HEADS = HeadsSettings()
+_PEOPLE = PeopleSettings()
 
 
-class LightFeaturesObjective(HeadsObjective):
+class LightFeaturesObjective(PeopleObjective):
     """1 minus the cosine between the predicted and the true direction of light."""
 
     chooses_by = "angle_deg"
@@ -40,20 +40,21 @@ class LightFeaturesObjective(HeadsObjective):
         self,
         source: SampleSource | DatasetFaces,
         network: LightNetwork | None = None,
-        settings: HeadsSettings = _HEADS,
+        settings: PeopleSettings = _PEOPLE,
     ) -> None:
         super().__init__("light_features", network or LightNetwork(), source, settings)
         if not isinstance(source, DatasetFaces):
             self.mean_normals = resize(source.mean_face()[0][None], _NORMALS_SIDE)[0]
 
-    def draw_head(self, head: Tensor, generator: torch.Generator) -> LightTextures | LitCrops:
+    def draw_person(self, person: int, generator: torch.Generator) -> LightTextures | LitCrops:
+        people = torch.tensor([person])
         if isinstance(self.source, DatasetFaces):
-            return self.source.draw_lights(head, self.settings.lights, generator)
-        sample = self.source.draw(head, self.settings.lights, generator)
+            return self.source.draw_lights(people, self.settings.lights, generator)
+        sample = self.source.draw(people, self.settings.lights, generator)
         seen = (sample.weight > 0).float()
         head_to_camera = head_rotation(self.mean_normals, sample.normals_target)
         lights_head = sample.lights @ head_to_camera  # row vectors: R^T w
-        return LightTextures(sample.target * seen[:, None], lights_head, head)
+        return LightTextures(sample.target * seen[:, None], lights_head, people)
 
     def _unwrapped(self, batch: LightTextures | LitCrops) -> LightTextures:
         return self.source.light_textures(batch) if isinstance(batch, LitCrops) else batch
@@ -181,7 +182,7 @@ class AppearanceObjective(Objective):
 def build(run: Run) -> Objective:
     """Make the objective of the stage `light-features`."""
     network = run.features("light_features", run.texture_side)
-    settings = HeadsSettings(held_out_heads=run.sizes.held_out_heads)
+    settings = PeopleSettings(held_out_people=run.sizes.held_out_people)
     objective: Objective = run.objective(LightFeaturesObjective)(run.faces(), network, settings)
     return objective
 

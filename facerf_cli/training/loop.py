@@ -173,8 +173,8 @@ class Trainer:
         total, gradient, *parts = torch.cat([values[:1], norm[None], values[1:]]).tolist()
         if not (math.isfinite(total) and math.isfinite(gradient)):  # before it changes the weights
             what = "gradient" if math.isfinite(total) else "loss"
-            heads = getattr(batch, "heads", None)
-            of = f", heads {heads.tolist()}" if heads is not None else ""
+            people = getattr(batch, "people", None)
+            of = f", people {people.tolist()}" if people is not None else ""
             kept = f"the last good state is kept in {self.state_path}"
             kept = kept if self.state_path.exists() else "no state was saved before it"
             raise FacerfError(f"the {what} is not finite at step {step} (seed {settings.seed}{of}); {kept}")

@@ -25,17 +25,13 @@ class Validation:
 class Objective(nn.Module):
     """Base of the training stages: batches, loss terms and validation.
 
-    Subclasses implement `draw_one`, `forward` and `validate`; if they use `held_out_samples`, they set
-    `held_out` and `settings`.
+    Subclasses implement `draw`, `forward` and `validate`.
     """
 
     chooses_by: str  # metric of `validate` (lower is better) that selects best.safetensors
     source_colours: SourceColours | None = None  # of a trained Reflectance Network's sources
     skips_networks: bool = False  # True if a batch may leave some weights without a gradient
     bf16: bool = False  # set by the loop, for `mixed_precision`
-    held_out: Any  # numbers of the people that are only validated on
-    settings: Any  # with `held_out_draws`, the samples of each of them
-    validation_seed: int = 12345
 
     def __init__(self, networks: dict[str, nn.Module], provenance: dict[str, Any]) -> None:
         """Make a stage that trains, averages and saves networks, by the names of `network/checkpoint.py`.
@@ -46,7 +42,6 @@ class Objective(nn.Module):
         self.networks = nn.ModuleDict(networks)
         self.provenance = provenance
         self.inputs: dict[str, Any] = {}  # entries of `INPUTS`
-        self._held_out_samples: list[Any] = []
 
     def draw(self, count: int, generator_of: Callable[..., torch.Generator], step: int) -> Batch:
         """Draw `count` samples; sample i depends only on `generator_of(i)`.
@@ -55,25 +50,7 @@ class Objective(nn.Module):
         choice for the entire batch is drawn from `seeded(seed, step)`. Runs in data-loading workers, on the
         CPU and without the networks.
         """
-        return concatenate([self.draw_one(generator_of(i)) for i in range(count)])
-
-    def draw_one(self, generator: torch.Generator) -> Any:
-        """Draw one sample of a random person, B = 1."""
         raise NotImplementedError
-
-    def draw_held_out(self, person: int, generator: torch.Generator) -> Any:
-        """Draw one sample of a held-out person, B = 1."""
-        raise NotImplementedError
-
-    def held_out_samples(self) -> list[Any]:
-        """Return samples of the held-out people, B = 1, drawn once."""
-        if not self._held_out_samples:
-            self._held_out_samples = [
-                self.draw_held_out(int(person), seeded(self.validation_seed, int(person), index))
-                for index in range(self.settings.held_out_draws)
-                for person in self.held_out
-            ]
-        return self._held_out_samples
 
     def measure(self) -> None:
         """Measure constants of the losses with the networks, once all processes have them on their device."""
@@ -99,6 +76,54 @@ class Objective(nn.Module):
     @property
     def device(self) -> torch.device:
         return next(self.networks.parameters()).device
+
+
+class PeopleObjective(Objective):
+    """Base of the stages that train one network on samples of people; subclasses implement `draw_person`."""
+
+    validation_seed: int = 12345
+
+    def __init__(self, name: str, network: nn.Module, source: Any, settings: Any) -> None:
+        """Make a stage that trains the network `name`.
+
+        Args:
+            source: People to draw samples of, such as a `SampleSource`; with `provenance` and `people`.
+            settings: Settings with `held_out_people`, the number of people who are only validated on, and
+                `held_out_draws`, the number of samples of each of them.
+        """
+        super().__init__({name: network}, source.provenance)
+        self.source, self.settings = source, settings
+        self.people, self.held_out = source.people(settings.held_out_people)
+        self._held_out_samples: list[Any] = []
+
+    def draw(self, count: int, generator_of: Callable[..., torch.Generator], step: int) -> Any:
+        return concatenate([self.draw_one(generator_of(i)) for i in range(count)])
+
+    def draw_one(self, generator: torch.Generator) -> Any:
+        """Draw one sample of a random person, B = 1."""
+        return self.draw_person(self.any_person(generator), generator)
+
+    def any_person(self, generator: torch.Generator) -> int:
+        """Draw a person to train on."""
+        return int(self.people[int(torch.randint(len(self.people), (), generator=generator))])
+
+    def draw_person(self, person: int, generator: torch.Generator) -> Any:
+        """Draw one sample of a person, B = 1."""
+        raise NotImplementedError
+
+    def draw_held_out(self, person: int, generator: torch.Generator) -> Any:
+        """Draw one sample of a held-out person, B = 1."""
+        return self.draw_person(person, generator)
+
+    def held_out_samples(self) -> list[Any]:
+        """Return samples of the held-out people, B = 1, drawn once."""
+        if not self._held_out_samples:
+            self._held_out_samples = [
+                self.draw_held_out(int(person), seeded(self.validation_seed, int(person), index))
+                for index in range(self.settings.held_out_draws)
+                for person in self.held_out
+            ]
+        return self._held_out_samples
 
 
 def seeded(*numbers: int) -> torch.Generator:

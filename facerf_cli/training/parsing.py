@@ -5,6 +5,7 @@ matte and of its gradient. A landmark's error is weighted by the error that the 
 et al., *3D face reconstruction with dense landmarks*, 2022, Eq. 1).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,8 +19,8 @@ from facerf_cli.network.inputs import concatenate
 from facerf_cli.network.parsing import Parsing, ParsingNetwork
 from facerf_cli.portrait.parse import CLASSES
 from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
-from facerf_cli.training.build import Run
-from facerf_cli.training.objective import Objective, Validation
+from facerf_cli.training.objective import Objective, PeopleObjective, Validation
+from facerf_cli.training.run import Run
 from facerf_cli.training.sheets import FOUND_COLOUR, TRUE_COLOUR, in_rows, mark, tiled
 
 _SHEET_ROWS, _SHEET_COLUMNS = 6, 4
@@ -41,7 +42,7 @@ class ParsingObjectiveSettings:
     held_out_draws: int = 12
 
 
-class ParsingObjective(Objective):
+class ParsingObjective(PeopleObjective):
     """Errors of classes, matte, landmarks and presence on synthetic portraits."""
 
     chooses_by, validation_seed = "total", 20212
@@ -54,20 +55,21 @@ class ParsingObjective(Objective):
         settings: ParsingObjectiveSettings = ParsingObjectiveSettings(),
     ) -> None:
         network = network or ParsingNetwork()
-        super().__init__({"parsing": network}, portraits.provenance)
-        self.portraits = portraits
+        super().__init__("parsing", network, portraits, settings)
         self.side = network.side
-        self.settings = settings
-        self.people, self.held_out = portraits.people(settings.held_out_people)
         rarity = [settings.rare if name in _RARE else 1.0 for name in CLASSES]
         self.register_buffer("rarity", torch.tensor(rarity), persistent=False)
 
     def draw_one(self, generator: torch.Generator) -> PortraitCrops:
-        """Draw a crop of a random person."""
-        return self.portraits.draw(self.people, self.side, generator)
+        return self._draw(self.people, generator)
 
-    def draw_held_out(self, person: int, generator: torch.Generator) -> PortraitCrops:
-        return self.portraits.draw([person], self.side, generator)
+    def draw_person(self, person: int, generator: torch.Generator) -> PortraitCrops:
+        return self._draw([person], generator)
+
+    def _draw(self, people: Sequence[int], generator: torch.Generator) -> PortraitCrops:
+        """Draw a crop of one of the people."""
+        crops: PortraitCrops = self.source.draw(people, self.side, generator)
+        return crops
 
     def forward(self, batch: PortraitCrops) -> dict[str, Tensor]:
         """Compute the weighted terms, each a mean over crops."""
@@ -142,7 +144,7 @@ class ParsingObjective(Objective):
 
 def build(run: Run) -> Objective:
     """Make the objective of the stage; bake synthetic people that are missing."""
-    held_out = run.sizes.held_out_heads
+    held_out = run.sizes.held_out_people
     folder, provenance = run.bake_people(held_out, with_squares=False)
     stored = StoredPortraits(folder, run.backgrounds(run.bank), provenance)
     settings = ParsingObjectiveSettings(held_out_people=held_out)

@@ -21,11 +21,11 @@ from facerf_cli.synth.bank.portrait_samples import (
     SMALL,
     PortraitSample,
     PortraitSource,
-    StoredTransport,
+    StoredSquares,
 )
 from facerf_cli.synth.bank.proxies import add_proxies
-from facerf_cli.training.build import Run
-from facerf_cli.training.objective import Objective, Validation, seeded
+from facerf_cli.training.objective import Objective, PeopleObjective, Validation, seeded
+from facerf_cli.training.run import Run
 from facerf_cli.training.sheets import tiled
 
 _ROOT_OFFSET = 0.01  # keeps the slope of the root finite at black
@@ -56,7 +56,7 @@ class PortraitObjectiveSettings:
     held_out_draws: int = 3
 
 
-class PortraitObjective(Objective):
+class PortraitObjective(PeopleObjective):
     """Minimise errors of the images that the Portrait Network predicts."""
 
     chooses_by, validation_seed = "error", 20216
@@ -67,21 +67,20 @@ class PortraitObjective(Objective):
         network: PortraitNetwork | None = None,
         settings: PortraitObjectiveSettings = PortraitObjectiveSettings(),
     ) -> None:
-        super().__init__({"portrait": network or PortraitNetwork()}, portraits.provenance)
-        self.portraits, self.settings = portraits, settings
-        self.people, self.held_out = portraits.people(settings.held_out_people)
+        super().__init__("portrait", network or PortraitNetwork(), portraits, settings)
 
     def draw(self, count: int, generator_of: Callable[..., torch.Generator], step: int) -> Batch:
         """Draw `count` samples of random people, all in squares of one side (see `Objective.draw`)."""
-        sides = self.portraits.sides_px(self.people)
+        sides = self.source.sides_px(self.people)
         side = sides[int(torch.randint(len(sides), (), generator=seeded(step)))]
         targets = self.settings.targets
         return concatenate(
-            [self.portraits.draw(self.people, targets, generator_of(i), side) for i in range(count)]
+            [self.source.draw(self.people, targets, generator_of(i), side) for i in range(count)]
         )
 
-    def draw_held_out(self, person: int, generator: torch.Generator) -> PortraitSample:
-        return self.portraits.draw([person], self.settings.targets, generator)
+    def draw_person(self, person: int, generator: torch.Generator) -> PortraitSample:
+        sample: PortraitSample = self.source.draw([person], self.settings.targets, generator)
+        return sample
 
     def forward(self, batch: PortraitSample) -> dict[str, Tensor]:
         """Compute the weighted terms, each a mean over samples."""
@@ -193,22 +192,22 @@ def _best_scale(images: Tensor, batch: PortraitSample) -> Tensor:
 def build(run: Run) -> Objective:
     """Make the objective of the stage, on a dataset or on synthetic people."""
     options, sizes = run.options, run.sizes
-    held_out = min(sizes.held_out_heads, max(1, sizes.heads // 8))  # an eighth of a small bank
+    held_out = min(sizes.held_out_people, max(1, sizes.heads // 8))  # an eighth of a small bank
     source: PortraitSource
     if options.dataset:
         backgrounds = run.backgrounds(options.output)
         source = open_dataset_portraits(options.dataset, backgrounds, run.people, options.jobs)
     else:
-        source = _stored_transport(run, held_out)
+        source = _stored_squares(run, held_out)
     settings = PortraitObjectiveSettings(held_out_people=held_out)
     settings = replace(settings, targets=2) if run.is_tiny else settings
     objective: Objective = run.objective(PortraitObjective)(source, run.network("portrait"), settings)
     return objective
 
 
-def _stored_transport(run: Run, held_out: int) -> StoredTransport:
+def _stored_squares(run: Run, held_out: int) -> StoredSquares:
     """Open the bank of synthetic people; bake and analyse those that are missing."""
     options, backgrounds = run.options, run.backgrounds(run.bank)
     folder, provenance = run.bake_people(held_out, with_squares=True)
     add_proxies(folder, backgrounds, run.people, options.jobs, options.settings.seed)
-    return StoredTransport(folder, backgrounds, provenance)
+    return StoredSquares(folder, backgrounds, provenance)

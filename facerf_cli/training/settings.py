@@ -37,7 +37,7 @@ class StageEntry:
     """How a stage is built, and which options it has.
 
     Attributes:
-        build: Module and function that make its objective from a `Run` (`training/build.py`).
+        build: Module and function that make its objective from a `Run` (`training/run.py`).
         options: Options that apply to some stages, by name, and apply to this one.
         networks: The networks that it trains, if they are not named like the stage.
         in_paper: The preset paper trains it as the paper does.
@@ -169,7 +169,7 @@ class Sizes:
     views: int = 8
     texture_side: int = 128  # of a dataset's textures
     joint_side: int = 256  # of the stage joint's crops and textures
-    held_out_heads: int = 12
+    held_out_people: int = 12
     light_width: float = 0.25  # of S_f and V_f; 1 is VGG-16's
     bake_side: int = 128  # texels along a side of baked heads
     rig_lights: int = 150  # that heads and the mean face are baked under

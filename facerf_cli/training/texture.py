@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from facerf_cli.dataset.faces import DatasetFaces, SampleCrops
 from facerf_cli.errors import InputError
@@ -24,9 +24,15 @@ from facerf_cli.network.inputs import (
     without_cast,
 )
 from facerf_cli.synth.bank.texture_samples import Sample, SampleSource
-from facerf_cli.training.build import Run
 from facerf_cli.training.losses import clipped_si_mse, root_loss
-from facerf_cli.training.objective import Objective, Validation, metrics_by_pose, seeded
+from facerf_cli.training.objective import (
+    Objective,
+    PeopleObjective,
+    Validation,
+    metrics_by_pose,
+    seeded,
+)
+from facerf_cli.training.run import Run
 from facerf_cli.training.sheets import tiled
 
 _COLOUR_SEED, _COLOURS_MEASURED = 31415, 192
@@ -34,35 +40,15 @@ _SHEET_FACES = 5
 
 
 @dataclass(frozen=True)
-class HeadsSettings:
-    """Lights per face and step, and held-out heads, each drawn `held_out_draws` times."""
+class PeopleSettings:
+    """Lights per face and step, and held-out people, each drawn `held_out_draws` times."""
 
     lights: int = 8
-    held_out_heads: int = 12
+    held_out_people: int = 12
     held_out_draws: int = 4
 
 
-class HeadsObjective(Objective):
-    """Base of the stages that train one network on textures of heads."""
-
-    def __init__(self, name: str, network: nn.Module, source: Any, settings: HeadsSettings) -> None:
-        """Train a network `name` on a `SampleSource`, or another source of heads with provenance."""
-        super().__init__({name: network}, source.provenance)
-        self.source, self.settings = source, settings
-        self.heads, self.held_out = source.heads(settings.held_out_heads)
-
-    def draw_one(self, generator: torch.Generator) -> Any:
-        head = self.heads[torch.randint(len(self.heads), (1,), generator=generator)]
-        return self.draw_head(head, generator)
-
-    def draw_held_out(self, person: int, generator: torch.Generator) -> Any:
-        return self.draw_head(torch.tensor([person]), generator)
-
-    def draw_head(self, head: Tensor, generator: torch.Generator) -> Any:
-        raise NotImplementedError
-
-
-class SamplesObjective(HeadsObjective):
+class SamplesObjective(PeopleObjective):
     """Base of the stages that train one network on sources and their targets under single lights."""
 
     def draw(self, count: int, generator_of: Callable[..., torch.Generator], step: int) -> Any:
@@ -71,15 +57,16 @@ class SamplesObjective(HeadsObjective):
             return super().draw(count, generator_of, step)
         drawn = []
         for index in range(count):
-            head, crops = self.source.draw_shared(self.settings.lights, generator_of, index, step)
-            drawn.append(self.batch_of(crops, head, generator_of(index)))
+            person, crops = self.source.draw_shared(self.settings.lights, generator_of, index, step)
+            drawn.append(self.batch_of(crops, person, generator_of(index)))
         return concatenate(drawn)
 
-    def draw_head(self, head: Tensor, generator: torch.Generator) -> Any:
-        return self.batch_of(self.source.draw(head, self.settings.lights, generator), head, generator)
+    def draw_person(self, person: int, generator: torch.Generator) -> Any:
+        people = torch.tensor([person])
+        return self.batch_of(self.source.draw(people, self.settings.lights, generator), people, generator)
 
-    def batch_of(self, sample: Sample | SampleCrops, head: Tensor, generator: torch.Generator) -> Any:
-        """Make the batch of a sample of a head [1]."""
+    def batch_of(self, sample: Sample | SampleCrops, people: Tensor, generator: torch.Generator) -> Any:
+        """Make the batch of a sample of people [1]."""
         raise NotImplementedError
 
     def textures(self, sample: Sample | SampleCrops) -> Sample:
@@ -88,7 +75,7 @@ class SamplesObjective(HeadsObjective):
 
 
 @dataclass(frozen=True)
-class TextureObjectiveSettings(HeadsSettings):
+class TextureObjectiveSettings(PeopleSettings):
     """Settings of the stage `reflectance`."""
 
     lights: int = 4
@@ -98,10 +85,10 @@ class TextureObjectiveSettings(HeadsSettings):
 
 @dataclass(frozen=True)
 class TextureBatch(Batch):
-    """Samples and the indices of their heads [B]."""
+    """Samples and the indices of their people [B]."""
 
     sample: Sample | SampleCrops
-    heads: Tensor
+    people: Tensor
 
 
 class TextureObjective(SamplesObjective):
@@ -128,21 +115,21 @@ class TextureObjective(SamplesObjective):
         self.source_colours = SourceColours.of(self._measure_colours())
 
     def _measure_colours(self) -> Tensor:
-        """Measure mean colours [N, 3] of sources of the training heads."""
+        """Measure mean colours [N, 3] of sources of the training people."""
         if isinstance(self.source, DatasetFaces):
             return self.source.source_colours(_COLOURS_MEASURED, seeded(_COLOUR_SEED))
         colours = []
         for index in range(_COLOURS_MEASURED):
             generator = seeded(_COLOUR_SEED, index)
-            head = self.heads[torch.randint(len(self.heads), (1,), generator=generator)]
-            sample = self.source.draw(head, 1, generator)
+            person = torch.tensor([self.any_person(generator)])
+            sample = self.source.draw(person, 1, generator)
             colours.append(mean_colours(sample.source, sample.visible))
         return torch.cat(colours)
 
     def batch_of(
-        self, sample: Sample | SampleCrops, head: Tensor, generator: torch.Generator
+        self, sample: Sample | SampleCrops, people: Tensor, generator: torch.Generator
     ) -> TextureBatch:
-        return TextureBatch(sample, head)
+        return TextureBatch(sample, people)
 
     def draw_held_out(self, person: int, generator: torch.Generator) -> Sample | SampleCrops:
         drawn: Sample | SampleCrops = self.source.draw(
@@ -169,7 +156,7 @@ class TextureObjective(SamplesObjective):
 
     @torch.no_grad()
     def validate(self) -> Validation:
-        """Measure the mean Si-MSE of held-out heads, clipped at white: of all, and by the target's pose.
+        """Measure the mean Si-MSE of held-out people, clipped at white: of all, and by the target's pose.
 
         The sheet has two rows per face: source and true OLATs; visible source and predicted OLATs.
         """
@@ -202,6 +189,6 @@ def build(run: Run) -> Objective:
     """Make the objective of the stage."""
     side = run.texture_side
     light, network = run.light_features(side), run.reflectance(side)
-    settings = TextureObjectiveSettings(held_out_heads=run.sizes.held_out_heads)
+    settings = TextureObjectiveSettings(held_out_people=run.sizes.held_out_people)
     objective: Objective = run.objective(TextureObjective)(run.faces(), network, light, settings)
     return objective

@@ -185,14 +185,14 @@ def test_training_on_a_dataset_lowers_the_loss_and_names_it(faces: DatasetFaces,
 
 def test_the_only_person_is_validated_on(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     one = write_small_dataset(tmp_path, counts=(1, 0, 0), cameras=1, lights=4, crop_px=32)
-    assert [heads.tolist() for heads in open_faces(one.folder, "builtin", SIDE).heads(12)] == [[0], [0]]
+    assert [people.tolist() for people in open_faces(one.folder, "builtin", SIDE).people(12)] == [[0], [0]]
     assert "only one person" in caplog.text
 
 
 def test_splits_and_models_that_cannot_be_trained_on(dataset: Dataset, tmp_path: Path) -> None:
     refused(InputError, "no such face model", open_faces, dataset.folder, "nobody.npz", SIDE)
     none = write_small_dataset(tmp_path, counts=(2, 0, 0), cameras=1, lights=4, crop_px=32)
-    refused(InputError, "run prepare-dataset", open_faces(none.folder, "builtin", SIDE).heads, 1)
+    refused(InputError, "run prepare-dataset", open_faces(none.folder, "builtin", SIDE).people, 1)
     text = (tmp_path / "dataset.json").read_text().replace('"face_model": "builtin"', '"face_model": "other"')
     (tmp_path / "dataset.json").write_text(text)
     refused(InputError, "--fit-with", open_faces, none.folder, "builtin", SIDE)

@@ -15,7 +15,7 @@ from facerf_cli.training.diffuse_sh import (
 from facerf_cli.training.objective import seeded
 
 NETWORK = DiffuseSettings(32, (8, 12, 16), (8, 12, 16), 4, 4, 16)
-SETTINGS = SumSettings(lights=4, sums=2, held_out_heads=2, held_out_draws=2)
+SETTINGS = SumSettings(lights=4, sums=2, held_out_people=2, held_out_draws=2)
 
 
 def objective(bank: Bank) -> DiffuseObjective:

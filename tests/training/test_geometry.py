@@ -19,7 +19,7 @@ from tests.kinds import Folders
 from tests.refusals import refused
 from tests.synth.conftest import backgrounds
 
-FEW = GeometryObjectiveSettings(held_out_heads=1, held_out_draws=4)
+FEW = GeometryObjectiveSettings(held_out_people=1, held_out_draws=4)
 
 
 @pytest.fixture(scope="module")

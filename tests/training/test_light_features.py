@@ -16,11 +16,11 @@ from facerf_cli.synth.bank.heads import Bank
 from facerf_cli.synth.bank.texture_samples import Sample, camera_matrix
 from facerf_cli.training.light_features import LightFeaturesObjective
 from facerf_cli.training.objective import seeded
-from facerf_cli.training.texture import HeadsSettings
+from facerf_cli.training.texture import PeopleSettings
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.toy_faces import ToyFaces
 
-SETTINGS = HeadsSettings(lights=4, held_out_heads=2, held_out_draws=3)
+SETTINGS = PeopleSettings(lights=4, held_out_people=2, held_out_draws=3)
 
 
 def objective(bank: Bank) -> LightFeaturesObjective:
@@ -113,8 +113,8 @@ def test_directions_are_learnt_in_the_frame_of_the_head() -> None:
     turn = pose_to_rotation(35.0, -10.0, 5.0)
 
     class TurnedFaces(ToyFaces):
-        def draw(self, heads: Tensor, lights: int, generator: torch.Generator) -> Sample:
-            sample = super().draw(heads, lights, generator)
+        def draw(self, people: Tensor, lights: int, generator: torch.Generator) -> Sample:
+            sample = super().draw(people, lights, generator)
             return replace(sample, normals_target=torch.einsum("dc,bcij->bdij", turn, sample.normals_source))
 
     stage = LightFeaturesObjective(TurnedFaces(), LightNetwork(LightSettings(1 / 16, 4, 8)), SETTINGS)
@@ -125,5 +125,4 @@ def test_directions_are_learnt_in_the_frame_of_the_head() -> None:
 
 def _drawn(stage: LightFeaturesObjective, generator: torch.Generator) -> tuple[Tensor, int, torch.Generator]:
     """The arguments with which the stage draws a sample."""
-    head = stage.heads[torch.randint(len(stage.heads), (1,), generator=generator)]
-    return head, SETTINGS.lights, generator
+    return torch.tensor([stage.any_person(generator)]), SETTINGS.lights, generator

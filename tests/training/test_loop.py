@@ -227,12 +227,12 @@ def test_a_run_is_not_written_over_nor_resumed_otherwise(tmp_path: Path) -> None
 
 
 def test_a_loss_that_is_not_finite_stops_with_the_batch_named(tmp_path: Path) -> None:
-    heads = [batch.heads.tolist() for _, batch, _ in first_draws(5)]
-    poison = next(head for head in heads[4] if all(head not in before for before in heads[:4]))
+    people = [batch.people.tolist() for _, batch, _ in first_draws(5)]
+    poison = next(head for head in people[4] if all(head not in before for before in people[:4]))
     with pytest.raises(FacerfError) as caught:
         train(toy_objective(poison), tmp_path, replace(TINY, validate_every=2))
     assert str(caught.value) == (
-        f"the loss is not finite at step 5 (seed 0, heads {heads[4]}); "
+        f"the loss is not finite at step 5 (seed 0, people {people[4]}); "
         f"the last good state is kept in {tmp_path / 'state.pt'}"
     )
     assert state_of(tmp_path)["step"] == len(rows_of(tmp_path)) == 4

@@ -103,8 +103,8 @@ def test_a_batch_has_squares_of_one_side() -> None:
     stage = objective(perfect())
     asked = []
     for step in range(20):
-        stage.portraits.asked.clear()
+        stage.source.asked.clear()
         stage.draw(2, lambda index, step=step: torch.Generator(), step)
-        (side,) = set(stage.portraits.asked)
+        (side,) = set(stage.source.asked)
         asked.append(side)
     assert set(asked) == {SIDE, 2 * SIDE}

@@ -28,7 +28,7 @@ NETWORK = DefaultReflectanceSettings(
 
 
 def test_training_on_the_bank_lowers_the_loss(bank: Bank, tmp_path: Path) -> None:
-    settings = TextureObjectiveSettings(lights=3, held_out_heads=2, held_out_draws=2)
+    settings = TextureObjectiveSettings(lights=3, held_out_people=2, held_out_draws=2)
     objective = TextureObjective(bank, DefaultReflectanceNetwork(NETWORK), settings=settings)
     train(objective, tmp_path, replace(PRESETS["tiny"], steps=60))
     rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
@@ -43,14 +43,14 @@ def test_a_sample_depends_on_no_neighbour_and_a_batch_is_the_mean_of_its_halves(
     halves = [objective.draw(2, lambda i, first=first: seeded(5, first + i), 1) for first in (0, 2)]
     joined = concatenate([half.sample for half in halves])
     assert torch.equal(whole.sample.target, joined.target) and torch.equal(whole.sample.source, joined.source)
-    assert whole.heads.tolist() == [head for half in halves for head in half.heads.tolist()]
-    assert len(set(whole.heads.tolist())) > 1
+    assert whole.people.tolist() == [person for half in halves for person in half.people.tolist()]
+    assert len(set(whole.people.tolist())) > 1
     mean = torch.stack([objective(half)["root"] for half in halves]).mean()
     assert torch.allclose(objective(whole)["root"], mean, rtol=1e-6)
 
 
 def test_validation_measures_the_same_samples_every_time_and_tells_the_poses_apart(bank: Bank) -> None:
-    settings = TextureObjectiveSettings(held_out_heads=2, held_out_draws=12)
+    settings = TextureObjectiveSettings(held_out_people=2, held_out_draws=12)
     objective = TextureObjective(bank, DefaultReflectanceNetwork(NETWORK), settings=settings)
     first, second = objective.validate(), objective.validate()
     assert first.metrics == second.metrics
@@ -62,7 +62,7 @@ def test_validation_measures_the_same_samples_every_time_and_tells_the_poses_apa
 def test_the_loss_on_features_pulls_the_prediction_toward_the_target() -> None:
     torch.manual_seed(0)
     light = LightNetwork(LightSettings(width=0.05, grid=4, hidden=8)).eval().requires_grad_(False)
-    settings = TextureObjectiveSettings(lights=2, held_out_heads=3)
+    settings = TextureObjectiveSettings(lights=2, held_out_people=3)
     objective = TextureObjective(ToyFaces(), toy_objective().networks["reflectance"], light, settings)
     batch = objective.draw(2, lambda i: seeded(1, i), 1)
     terms = objective(batch)
@@ -77,7 +77,7 @@ def test_the_loss_on_features_pulls_the_prediction_toward_the_target() -> None:
 def test_the_papers_form_trains_on_textures(tmp_path: Path) -> None:
     network = PaperReflectanceNetwork(PaperReflectanceSettings(16, (8, 8), 8))
     objective = TextureObjective(
-        ToyFaces(), network, settings=TextureObjectiveSettings(lights=2, held_out_heads=3)
+        ToyFaces(), network, settings=TextureObjectiveSettings(lights=2, held_out_people=3)
     )
     loss = objective(objective.draw(2, lambda i: seeded(1, i), 1))["root"]
     loss.backward()
@@ -104,9 +104,9 @@ def test_without_normals_the_network_does_not_see_them(normals: bool) -> None:
 class ColouredFaces(ToyFaces):
     """Toys of which one in eight is in strongly blue light."""
 
-    def draw(self, heads: Tensor, lights: int, generator: torch.Generator) -> Sample:
-        sample = super().draw(heads, lights, generator)
-        blue = torch.where((heads % 8 == 0)[:, None], torch.tensor([0.1, 0.5, 3.0]), torch.ones(3))
+    def draw(self, people: Tensor, lights: int, generator: torch.Generator) -> Sample:
+        sample = super().draw(people, lights, generator)
+        blue = torch.where((people % 8 == 0)[:, None], torch.tensor([0.1, 0.5, 3.0]), torch.ones(3))
         return replace(sample, source=sample.source * blue[..., None, None])
 
 
@@ -131,12 +131,12 @@ class WritesDown(nn.Module):
 def test_the_network_sees_what_it_sees_at_test_time() -> None:
     """Strange colours of light are removed by the colours that the checkpoint keeps; targets are exposed."""
     network = WritesDown()
-    settings = TextureObjectiveSettings(lights=2, held_out_heads=3)
+    settings = TextureObjectiveSettings(lights=2, held_out_people=3)
     objective = TextureObjective(ColouredFaces(), network, settings=settings)
     colours = objective.source_colours
     assert colours is not None
     batches = (objective.draw(1, lambda i, k=k: seeded(k, i), 1) for k in range(99))
-    batch = next(found for found in batches if int(found.heads) % 8 == 0)
+    batch = next(found for found in batches if int(found.people) % 8 == 0)
     sample, terms = batch.sample, objective(batch)
     cast = colour_cast(sample.source, sample.visible, colours)
     assert cast[0, 2] > 1.5 * cast[0, 0]

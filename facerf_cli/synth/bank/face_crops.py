@@ -85,7 +85,7 @@ class RenderedFaces:
         self.faces = [person or everyone for person, everyone in zip(facing, faces, strict=True)]
         self.backgrounds, self.provenance = backgrounds, provenance
 
-    def heads(self, held_out: int) -> tuple[list[int], list[int]]:
+    def people(self, held_out: int) -> tuple[list[int], list[int]]:
         return split_people(len(self.faces), held_out)
 
     def mean_translation_m(self) -> tuple[float, float, float]:
@@ -94,17 +94,17 @@ class RenderedFaces:
         x, y, z = torch.stack(shifts_m).mean(0).tolist()
         return x, y, z
 
-    def draw(self, head: int, side: int, generator: torch.Generator) -> FaceCrops:
+    def draw(self, person: int, side: int, generator: torch.Generator) -> FaceCrops:
         """Draw one crop of a person, [1, 3, side, side], with its fit."""
-        faces = self.faces[head]
+        faces = self.faces[person]
         face = faces[int(torch.randint(len(faces), (), generator=generator))]
         photo = read_photo(face.path, generator)
         if torch.rand((), generator=generator) < 0.5:
             photo, face = photo.mirrored(), face.mirrored(photo.side_px)
         crop, fit = _draw_crop(face.centre_px, face.side_px, generator), face.fit
         pixels = torch.cat([photo.radiance, photo.alpha[None]])
-        person = resample(pixels, crop.positions_px(side))
-        image = recoloured(self._composed(person, generator), _CAMERA.colours(generator))
+        cut = resample(pixels, crop.positions_px(side))
+        image = recoloured(self._composed(cut, generator), _CAMERA.colours(generator))
         rotation, translation_m = crop.pose(
             face.centre_px, face.side_px, fit["rotation"], fit["translation_m"]
         )

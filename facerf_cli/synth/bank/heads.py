@@ -284,13 +284,13 @@ class Bank:
     def side(self) -> int:
         return int(self.baked[0].normals.shape[-1])
 
-    def heads(self, held_out: int) -> tuple[Tensor, Tensor]:
+    def people(self, held_out: int) -> tuple[Tensor, Tensor]:
         """See `SampleSource`; the mean face is in neither part."""
         return torch.arange(held_out + 1, len(self.baked)), torch.arange(1, held_out + 1)
 
-    def draw(self, heads: Tensor, lights: int, generator: torch.Generator) -> Sample:
-        """Draw one sample of each head in `heads` [B], with `lights` target lights."""
-        chosen = [(self.baked[int(head)], self.views[int(head)]) for head in heads]
+    def draw(self, people: Tensor, lights: int, generator: torch.Generator) -> Sample:
+        """Draw one sample of each of the `people` [B], with `lights` target lights."""
+        chosen = [(self.baked[int(person)], self.views[int(person)]) for person in people]
         return draw_sample(chosen, lights, generator)
 
     def mean_face(self) -> tuple[Tensor, Tensor, Tensor]:

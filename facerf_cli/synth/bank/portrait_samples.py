@@ -95,7 +95,7 @@ class PortraitSource(Protocol):
         """Draw one sample [1, ...] of some people, with `targets` lights, of a side if one is given."""
 
 
-class StoredTransport:
+class StoredSquares:
     """Squares of a bank, read when they are drawn."""
 
     def __init__(self, folder: Path, backgrounds: Tensor, provenance: dict[str, Any]) -> None:

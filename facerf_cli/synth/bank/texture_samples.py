@@ -62,11 +62,11 @@ class SampleSource(Protocol):
     def side(self) -> int:
         """Texels along a side of every field."""
 
-    def heads(self, held_out: int) -> tuple[Tensor, Tensor]:
-        """Indices for `draw` of the heads to train on, and of at most `held_out` heads to validate on."""
+    def people(self, held_out: int) -> tuple[Tensor, Tensor]:
+        """Indices for `draw` of the people to train on, and of at most `held_out` people to validate on."""
 
-    def draw(self, heads: Tensor, lights: int, generator: torch.Generator) -> Sample:
-        """Draw one sample of each head in `heads` [B], with `lights` target lights."""
+    def draw(self, people: Tensor, lights: int, generator: torch.Generator) -> Sample:
+        """Draw one sample of each of the `people` [B], with `lights` target lights."""
 
     def mean_face(self) -> tuple[Tensor, Tensor, Tensor]:
         """Return the mean's normals [3, T, T], visibility [L, T, T] and directions [L, 3], head frame."""

@@ -27,7 +27,7 @@ from facerf_cli.synth.bank import Files, people, portrait_samples
 from facerf_cli.synth.bank.people import PeopleBankSettings, add_people, photos_in, read_photo
 from facerf_cli.synth.bank.portrait_samples import (
     PortraitSample,
-    StoredTransport,
+    StoredSquares,
     StoredView,
     draw_targets,
     load_view,
@@ -52,7 +52,7 @@ def view(folder: Path) -> StoredView:
 
 
 def drawn(folder: Path, seed: int) -> PortraitSample:
-    stored = StoredTransport(folder, backgrounds(), {"licence": "MIT"})
+    stored = StoredSquares(folder, backgrounds(), {"licence": "MIT"})
     return stored.draw([0], 3, torch.Generator().manual_seed(seed))
 
 
@@ -141,7 +141,7 @@ def test_a_photo_that_ends_shows_its_last_row_beyond(folder: Path) -> None:
     """The person below counts nothing; nothing of it is seen, but for the proxy."""
     rows, side = 163, 192  # of the first square
     assert int(load_file(seen_path(folder / "00001_0.safetensors"))["rows"]) == rows
-    stored = StoredTransport(folder, backgrounds(), {"licence": "MIT"})
+    stored = StoredSquares(folder, backgrounds(), {"licence": "MIT"})
     sample = stored.draw([0], 3, torch.Generator().manual_seed(1), side)
     image = sample.inputs.image
     beyond, last = image[..., rows:, :], image[..., rows - 1 : rows, :]
@@ -225,7 +225,7 @@ def test_finished_people_are_kept_and_squares_added(tmp_path: Path, monkeypatch:
     for count, squares in ((2, False), (3, False), (3, True), (3, True)):
         add_people(tmp_path, ["a", "b"], range(count), 1, 0, replace(SMALL, with_squares=squares))
     assert made == [0, 1, 2, 0, 1, 2] and len(list(tmp_path.iterdir())) == 9
-    refused(InputError, "no portraits", StoredTransport, tmp_path, backgrounds(), {})
+    refused(InputError, "no portraits", StoredSquares, tmp_path, backgrounds(), {})
     refused(InputError, "no photos", photos_in, tmp_path / "empty")
 
 
