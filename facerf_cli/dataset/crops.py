@@ -199,7 +199,7 @@ class PairReader:
         ]
         exposed = source * (MEAN_RADIANCE / stacks[0].colour_on_face(source).mean())
         source_px, target_px = (
-            self.side_px * move.points(stack.landmarks_px / stack.side_px)[None]
+            self.side_px * move.points(stack.fit.landmarks_px / stack.side_px)[None]
             for stack, move in zip(stacks, (moved, moved_target), strict=True)
         )
         return CropPairs(
@@ -297,10 +297,6 @@ class StackInfo:
     @property
     def side_px(self) -> int:
         return self.fit.crop.size_px
-
-    @property
-    def landmarks_px(self) -> Tensor:
-        return self.fit.landmarks_px
 
     @property
     def face(self) -> Tensor:

@@ -195,10 +195,6 @@ class Dataset(DatasetFolder):
         places = {name: place for place, name in enumerate(self.light_ids)}
         return tuple(places[light] for light in lights)
 
-    def traits_of(self, subject: str) -> dict[str, Any]:
-        """Return a subject's traits; {} if the capture lists none."""
-        return self.entries[subject].traits
-
     @cached_property
     def _split_by_subject(self) -> dict[str, str]:
         return {subject: split for split, members in self.splits.items() for subject in members}

@@ -285,7 +285,7 @@ class DatasetPerson:
 
     def _skin(self, trait: str) -> float | None:
         """Return a skin parameter of the capture; None if it is missing or the face has random colours."""
-        traits = self.dataset.traits_of(self.name)
+        traits = self.dataset.entries[self.name].traits
         value = traits.get(trait)
         if not isinstance(value, int | float) or traits.get("random_texture"):
             return None

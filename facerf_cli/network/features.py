@@ -92,13 +92,9 @@ class VggFeatures(nn.Module):
                 modules.append(nn.MaxPool2d(2) if index in _POOLS else nn.ReLU(inplace=True))
         self.features = nn.Sequential(*modules)
         self.out_channels = entering
-        self._wanted = {index: channels[index - 1] for index in sorted(wanted.values())}
+        self.layer_channels = {index: channels[index - 1] for index in sorted(wanted.values())}
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("deviation", torch.tensor(IMAGENET_DEVIATION).view(3, 1, 1), persistent=False)
-
-    def layer_channels(self) -> list[int]:
-        """Number of channels of each wanted layer."""
-        return list(self._wanted.values())
 
     def layers(self, linear: Tensor) -> list[Tensor]:
         """Return features [B, C, H / s, W / s], s = 1, 2, 4 .., of the wanted layers, of [B, 3, H, W]."""
@@ -106,7 +102,7 @@ class VggFeatures(nn.Module):
         features = []
         for index, module in enumerate(self.features):
             x = module(x)
-            if index in self._wanted:
+            if index in self.layer_channels:
                 features.append(x)
         return features
 
@@ -211,7 +207,9 @@ class Lpips(nn.Module):
         """Make an untrained network; `width` scales the channels, for tests: 1 is the published one."""
         super().__init__()
         self.trunk = VggFeatures(width, LPIPS_LAYERS)
-        self.heads = nn.ParameterList([torch.ones(count) / count for count in self.trunk.layer_channels()])
+        self.heads = nn.ParameterList(
+            [torch.ones(count) / count for count in self.trunk.layer_channels.values()]
+        )
 
     def forward(self, first: Tensor, second: Tensor) -> Tensor:
         """Return LPIPS [B] of scene-linear images [B, 3, H, W] with sides of at least 16 px."""

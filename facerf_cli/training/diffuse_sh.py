@@ -19,12 +19,11 @@ from facerf_cli.network.diffuse_sh import ORDER, DiffuseEstimate, DiffuseNetwork
 from facerf_cli.network.inputs import Batch, to_root
 from facerf_cli.synth.bank.texture_samples import Sample, SampleSource
 from facerf_cli.training.losses import clipped_si_mse, root_loss
-from facerf_cli.training.objective import Objective, Validation, metrics_by_pose
+from facerf_cli.training.objective import Objective
 from facerf_cli.training.run import Run
 from facerf_cli.training.sheets import tiled
 from facerf_cli.training.texture import PeopleSettings, SamplesObjective
 
-_SHEET_FACES = 5
 _TOTAL = 1.5  # of a sum's weights: a face lit from the front then has about the albedo's radiance
 _UNEVEN = 2.0  # exponent of the uniform draws: some sums are nearly a single light
 _TINT = 0.15  # standard deviation of the logarithm of a light's colour
@@ -49,8 +48,6 @@ class DiffuseBatch(Batch):
 
 class DiffuseObjective(SamplesObjective):
     """`root_loss` of the source under its estimated light, and of sums of known lights."""
-
-    chooses_by = "si_mse"
 
     def __init__(
         self,
@@ -88,29 +85,18 @@ class DiffuseObjective(SamplesObjective):
             "targets": root_loss(to_root(relit), targets, sample.weight),
         }
 
-    @torch.no_grad()
-    def validate(self) -> Validation:
-        """Measure the mean Si-MSE of held-out people, clipped at white: of targets, by pose, and of sources.
+    def measure_sample(self, batch: DiffuseBatch) -> tuple[Sample, dict[str, Tensor], np.ndarray]:
+        """Measure the Si-MSE of targets and source, clipped at white.
 
-        The sheet has two rows per face: source and targets; predicted source and targets, albedo and shading.
+        The rows are source and targets; predicted source and targets, albedo and shading.
         """
-        errors: list[Tensor] = []
-        same_pose: list[bool] = []
-        rows: list[np.ndarray] = []
-        for held_out in self.held_out_samples():
-            batch = held_out.to(self.device)
-            sample = sum_lights(self.textures(batch.sample), batch.weights)
-            estimate = self.network(sample.source, sample.normals_source, sample.visible)
-            own, relit = predicted_images(estimate, sample, batch.coefficients)
-            of_source = clipped_si_mse(own, sample.source[:, None], sample.visible).mean()
-            of_target = clipped_si_mse(relit, sample.target, sample.weight).mean()
-            errors.append(torch.stack([of_target, of_source]).cpu())
-            turned = (sample.normals_source - sample.normals_target).abs().max()
-            same_pose.append(bool(turned < 1e-3))
-            rows += [_sheet_rows(sample, estimate, own, relit)] if len(rows) < _SHEET_FACES else []
-        of_targets, of_sources = torch.stack(errors).T
-        metrics = metrics_by_pose(of_targets, torch.tensor(same_pose))
-        return Validation({**metrics, "si_mse_source": float(of_sources.mean())}, np.concatenate(rows))
+        sample = sum_lights(self.textures(batch.sample), batch.weights)
+        estimate = self.network(sample.source, sample.normals_source, sample.visible)
+        own, relit = predicted_images(estimate, sample, batch.coefficients)
+        of_target = clipped_si_mse(relit, sample.target, sample.weight).mean()
+        of_source = clipped_si_mse(own, sample.source[:, None], sample.visible).mean()
+        rows = _sheet_rows(sample, estimate, own, relit)
+        return sample, {"si_mse": of_target, "si_mse_source": of_source}, rows
 
 
 def draw_sums(sums: int, lights: int, generator: torch.Generator) -> Tensor:

@@ -72,7 +72,7 @@ class GeometryObjective(PeopleObjective):
     def forward(self, batch: FaceCrops) -> dict[str, Tensor]:
         """Compute the weighted terms, each a mean over faces."""
         with self.mixed_precision():
-            estimate = GeometryEstimate(*(x.float() for x in self.estimate(batch.crops)))
+            estimate = GeometryEstimate(*(x.float() for x in self.network(batch.crops)))
         settings, fit = self.settings, FitSettings()
         weight = torch.ones(68, device=batch.crops.device)
         weight[list(CONTOUR)] = settings.contour
@@ -89,11 +89,6 @@ class GeometryObjective(PeopleObjective):
             "depth": settings.depth * depth.mean(),
             "coefficients": settings.coefficients * squared.mean(),
         }
-
-    def estimate(self, crops: Tensor) -> GeometryEstimate:
-        """Run the network on crops [B, 3, S, S]."""
-        estimate: GeometryEstimate = self.network(crops)
-        return estimate
 
     def landmarks_px(self, estimate: GeometryEstimate, side: int) -> Tensor:
         """Project the landmarks [B, 68, 2] of an estimate into a crop of a side, differentiably."""
@@ -118,7 +113,7 @@ class GeometryObjective(PeopleObjective):
     def validate(self) -> Validation:
         """Measure mean errors on held-out people; landmarks in percent of the inter-ocular distance."""
         batch = concatenate(self.held_out_samples()).to(self.device)
-        estimate = self.estimate(batch.crops)
+        estimate = self.network(batch.crops)
         distance_px = (self.landmarks_px(estimate, self.side) - batch.landmarks_px).norm(dim=-1)
         left, right = OUTER_EYE_CORNERS
         eyes_px = (batch.landmarks_px[:, left] - batch.landmarks_px[:, right]).norm(dim=-1)

@@ -315,7 +315,7 @@ class JointObjective(Objective):
         """
         networks: Any = self.feature_networks.items()
         for name, network in networks:
-            apart = self.settings.weights.channels_apart and isinstance(network, TrainedFeatures)
+            apart = isinstance(network, TrainedFeatures)
             powers = torch.zeros(len(FEATURE_LAYERS), device=self.device)
             if process_rank() == 0:
                 pairs = spread_pairs(self._train, _TARGETS_MEASURED, lambda pair: True)

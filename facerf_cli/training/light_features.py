@@ -143,16 +143,12 @@ class AppearanceObjective(Objective):
     def forward(self, batch: CropPairs) -> dict[str, Tensor]:
         """Compute the terms `people` and `light`, means over images."""
         with self.mixed_precision():
-            scores, lights = self._found(batch)
+            scores, lights = self.network(torch.cat([batch.source, batch.target]))
         people = torch.cat([batch.people, batch.people])
         return {
             "people": F.cross_entropy(scores, people),
             "light": 1 - (lights[len(batch.light) :] * batch.light).sum(-1).mean(),
         }
-
-    def _found(self, batch: CropPairs) -> tuple[Tensor, Tensor]:
-        scores, lights = self.network(torch.cat([batch.source, batch.target]))
-        return scores, lights
 
     @torch.no_grad()
     def validate(self) -> Validation:
@@ -166,10 +162,10 @@ class AppearanceObjective(Objective):
         known, strangers = self._validation
         right, angles = [], []
         for pair in known:
-            scores, _ = self._found(pair.to(self.device))
+            scores, _ = self.network(torch.cat([pair.source, pair.target]).to(self.device))
             right.append(scores.argmax(1).cpu() == pair.people)
         for pair in strangers:
-            _, lights = self._found(pair.to(self.device))
+            _, lights = self.network(torch.cat([pair.source, pair.target]).to(self.device))
             cosine = (lights[1:].cpu() * pair.light).sum(-1).double().clamp(-1, 1)
             angles.append(torch.rad2deg(cosine.acos()))
         metrics = {

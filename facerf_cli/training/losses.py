@@ -8,7 +8,8 @@ at its weights:
 - radiance is scene-linear, exposed by `dataset/crops.py`; feature networks see it as sRGB
   (`network/features.py`);
 - S_f and a V_f that facerf trained see each colour channel separately, divided by the target's mean of it
-  (`channels_apart`): their filters happen to prefer some colours, and would tint uncertain areas;
+  (`channels_apart`): their filters happen to prefer some colours, and would tint uncertain areas; ImageNet's
+  V_f sees colours;
 - textures are compared where the target's camera sees the face; the target's texture gets no gradient.
 """
 

@@ -130,9 +130,3 @@ def seeded(*numbers: int) -> torch.Generator:
     """Make a CPU generator from non-negative numbers; their order and count also matter."""
     state = int(np.random.SeedSequence((len(numbers), *numbers)).generate_state(1, np.uint64)[0])
     return torch.Generator().manual_seed(state >> 1)
-
-
-def metrics_by_pose(errors: Tensor, same_pose: Tensor) -> dict[str, float]:
-    """Average the Si-MSE [N]: of all, and by whether the target has the source's pose [N]."""
-    parts = {"": torch.ones_like(same_pose), "_same_pose": same_pose, "_other_pose": ~same_pose}
-    return {f"si_mse{name}": float(errors[part].mean()) for name, part in parts.items() if part.any()}

@@ -108,11 +108,7 @@ class Constant:
 
 @dataclass(frozen=True)
 class PaperWeights:
-    """Weights of the paper: lambda_l, lambda_r, lambda_p, lambda_f; of L_r, lambda_alpha and lambda_beta.
-
-    With `channels_apart`, S_f and a V_f trained by facerf compare each colour channel separately; ImageNet's
-    V_f always sees colours, as in the paper.
-    """
+    """Weights of the paper: lambda_l, lambda_r, lambda_p, lambda_f; of L_r, lambda_alpha and lambda_beta."""
 
     landmarks: float = 25.0
     regularisation: float = 1.0
@@ -120,7 +116,6 @@ class PaperWeights:
     features: float = 1.0
     alpha: float = 0.4
     beta: float = 0.002
-    channels_apart: bool = True
 
 
 # The tables of settings that a configuration file may change, and their kinds.

@@ -29,7 +29,6 @@ from facerf_cli.training.objective import (
     Objective,
     PeopleObjective,
     Validation,
-    metrics_by_pose,
     seeded,
 )
 from facerf_cli.training.run import Run
@@ -50,6 +49,8 @@ class PeopleSettings:
 
 class SamplesObjective(PeopleObjective):
     """Base of the stages that train one network on sources and their targets under single lights."""
+
+    chooses_by = "si_mse"
 
     def draw(self, count: int, generator_of: Callable[..., torch.Generator], step: int) -> Any:
         """Draw `count` samples; a dataset's samples share the stacks of their sources with other steps."""
@@ -73,6 +74,32 @@ class SamplesObjective(PeopleObjective):
         """Unwrap the crops of a dataset; samples of baked heads are textures already."""
         return self.source.sample(sample) if isinstance(sample, SampleCrops) else sample
 
+    @torch.no_grad()
+    def validate(self) -> Validation:
+        """Average the errors of held-out people that `measure_sample` returns; the first also by pose.
+
+        The poses are the source's, and another one of the target.
+        """
+        errors: list[Tensor] = []
+        same_pose: list[bool] = []
+        rows: list[np.ndarray] = []
+        for held_out in self.held_out_samples():
+            sample, measured, face_rows = self.measure_sample(held_out.to(self.device))
+            errors.append(torch.stack([*measured.values()]).cpu())
+            turned = (sample.normals_source - sample.normals_target).abs().max()
+            same_pose.append(bool(turned < 1e-3))
+            rows += [face_rows] if len(rows) < _SHEET_FACES else []
+        of_name, same = dict(zip(measured, torch.stack(errors).T, strict=True)), torch.tensor(same_pose)
+        si_mse = of_name.pop("si_mse")
+        parts = {"": torch.ones_like(same), "_same_pose": same, "_other_pose": ~same}
+        metrics = {f"si_mse{name}": float(si_mse[part].mean()) for name, part in parts.items() if part.any()}
+        metrics |= {name: float(values.mean()) for name, values in of_name.items()}
+        return Validation(metrics, np.concatenate(rows))
+
+    def measure_sample(self, batch: Any) -> tuple[Sample, dict[str, Tensor], np.ndarray]:
+        """Return a held-out sample unwrapped, its errors (`si_mse` and others) and two rows of the sheet."""
+        raise NotImplementedError
+
 
 @dataclass(frozen=True)
 class TextureObjectiveSettings(PeopleSettings):
@@ -93,8 +120,6 @@ class TextureBatch(Batch):
 
 class TextureObjective(SamplesObjective):
     """`root_loss` of OLAT textures at the network's exposure; `light` is a frozen S_f."""
-
-    chooses_by = "si_mse"
 
     def __init__(
         self,
@@ -154,35 +179,19 @@ class TextureObjective(SamplesObjective):
             terms["light_features"] = self.settings.light_features * distance
         return terms
 
-    @torch.no_grad()
-    def validate(self) -> Validation:
-        """Measure the mean Si-MSE of held-out people, clipped at white: of all, and by the target's pose.
-
-        The sheet has two rows per face: source and true OLATs; visible source and predicted OLATs.
-        """
-        errors: list[Tensor] = []
-        same_pose: list[bool] = []
-        rows: list[np.ndarray] = []
-        for held_out in self.held_out_samples():
-            sample = self.textures(held_out.to(self.device))
-            encoded = self._encoded(sample)
-            predicted = self.network.decode(encoded, sample.normals_target, sample.lights)
-            errors.append(clipped_si_mse(predicted, sample.target, sample.weight).mean().cpu())
-            turned = (sample.normals_source - sample.normals_target).abs().max()
-            same_pose.append(bool(turned < 1e-3))
-            rows += [_sheet_rows(sample, predicted)] if len(rows) < _SHEET_FACES else []
-        return Validation(metrics_by_pose(torch.stack(errors), torch.tensor(same_pose)), np.concatenate(rows))
+    def measure_sample(self, batch: Sample | SampleCrops) -> tuple[Sample, dict[str, Tensor], np.ndarray]:
+        """Measure the Si-MSE, clipped at white; draw source and true, visible source and predicted OLATs."""
+        sample = self.textures(batch)
+        predicted = self.network.decode(self._encoded(sample), sample.normals_target, sample.lights)
+        error = clipped_si_mse(predicted, sample.target, sample.weight).mean()
+        mask = (sample.weight[0] > 0).float()
+        truth = [sample.source[0], *(sample.target[0] * mask)]
+        rows = [truth, [sample.source[0] * sample.visible[0], *(predicted[0] * mask)]]
+        return sample, {"si_mse": error}, tiled(rows)
 
     def _encoded(self, sample: Sample) -> Any:
         source = without_cast(sample.source, sample.visible, self.source_colours)
         return self.network.encode(source, sample.normals_source, sample.visible)
-
-
-def _sheet_rows(sample: Sample, predicted: Tensor) -> np.ndarray:
-    """Draw two rows of textures [2T, (L + 1) T, 3] of a sample's face."""
-    mask = (sample.weight[0] > 0).float()
-    truth = [sample.source[0], *(sample.target[0] * mask)]
-    return tiled([truth, [sample.source[0] * sample.visible[0], *(predicted[0] * mask)]])
 
 
 def build(run: Run) -> Objective:

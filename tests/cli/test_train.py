@@ -84,12 +84,11 @@ def test_a_configuration_reaches_loss_and_optimizer(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(training_run, "run_training", lambda options, training, typed: seen.append(training))
     (tmp_path / "c.toml").write_text(
         "[train]\nstage = 'joint'\ndataset = 'd'\nema-decay = 0\n[train.loss]\nfeatures = 0.1\n"
-        "channels_apart = false\n"
         "[train.optimizer]\nname = 'Adadelta'\neps = 1e-6\n[train.schedule]\nname = 'Constant'\n"
     )
     assert main(["--config", str(tmp_path / "c.toml"), "train", "-o", str(tmp_path / "run")]) == 0
     (training,) = seen
-    assert training.loss == PaperWeights(features=0.1, channels_apart=False) and training.ema_decay is None
+    assert training.loss == PaperWeights(features=0.1) and training.ema_decay is None
     assert training.optimizer == Adadelta(eps=1e-6) and training.schedule == Constant()
 
 
