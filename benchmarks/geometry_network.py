@@ -25,8 +25,8 @@ from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import CONTOUR, OUTER_EYE_CORNERS
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.files.read import read_image
+from facerf_cli.network.batch import concatenate
 from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork
-from facerf_cli.network.inputs import concatenate
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import crop_camera
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, load_models

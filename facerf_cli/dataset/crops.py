@@ -31,7 +31,8 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.fit import FaceFit, load_fit
 from facerf_cli.face.topology import grid_triangles, on_device
 from facerf_cli.files.olat_stack import read_olats
-from facerf_cli.network.inputs import MEAN_RADIANCE, Batch, concatenate, resize
+from facerf_cli.network.batch import Batch, concatenate
+from facerf_cli.network.inputs import MEAN_RADIANCE, resize
 from facerf_cli.raster.camera import Camera, crop_camera
 from facerf_cli.raster.texture import UnwrapSettings, point_weights, unwrap
 from facerf_cli.synth.bank.texture_samples import draw_light, draw_target_lights

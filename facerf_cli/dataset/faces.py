@@ -29,7 +29,8 @@ from facerf_cli.face.topology import grid_triangles, on_device
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.light.sphere import RIG_LIGHTS
 from facerf_cli.light.transport import BakeSettings
-from facerf_cli.network.inputs import MEAN_RADIANCE, Batch, resize
+from facerf_cli.network.batch import Batch
+from facerf_cli.network.inputs import MEAN_RADIANCE, resize
 from facerf_cli.raster.texture import inpaint, normal_map
 from facerf_cli.synth.bank.heads import HeadBakeSettings, bake_head
 from facerf_cli.synth.bank.texture_samples import CameraResponse, Sample, camera_matrix, draw_target_lights

@@ -20,7 +20,7 @@ from facerf_cli.face.crop import from_landmarks
 from facerf_cli.files.documents import Document, Points68, read_document, write_document
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_display
-from facerf_cli.network.inputs import Batch
+from facerf_cli.network.batch import Batch
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.relighting.models import Networks
 from facerf_cli.run.logs import LOGGER_NAME

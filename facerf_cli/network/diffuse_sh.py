@@ -16,17 +16,8 @@ from torch import Tensor, nn
 
 from facerf_cli.light.sh import irradiance, sh_basis
 from facerf_cli.light.sphere import rig_directions
-from facerf_cli.network.inputs import (
-    MEAN_RADIANCE,
-    Count,
-    Down,
-    SavedNetwork,
-    Side,
-    Widths,
-    exposure_of,
-    head_rotation,
-    resize,
-)
+from facerf_cli.network.base import Count, Down, SavedNetwork, Side, Widths
+from facerf_cli.network.inputs import MEAN_RADIANCE, exposure_of, head_rotation, resize
 
 ORDER = 2
 COEFFICIENTS = (ORDER + 1) ** 2

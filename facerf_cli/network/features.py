@@ -21,7 +21,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from facerf_cli.network.inputs import Count, Grid, SavedNetwork, Side, VggWidth, resize
+from facerf_cli.network.base import Count, Grid, SavedNetwork, Side, VggWidth
+from facerf_cli.network.inputs import resize
 
 # Index of each convolution in torchvision's `features`, and its channels.
 CONVOLUTIONS = (

@@ -17,7 +17,8 @@ import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor, nn
 
-from facerf_cli.network.inputs import Down, SavedNetwork, resize
+from facerf_cli.network.base import Down, SavedNetwork
+from facerf_cli.network.inputs import resize
 
 GeometryForm = Literal["default", "paper"]
 _SIDES: dict[str, int] = {"default": 64, "paper": 224}  # of each form's crop

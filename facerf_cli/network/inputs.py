@@ -1,29 +1,16 @@
-"""Shared parts of networks: settings in checkpoints, batches, precision, and preparation of textures.
+"""Preparation of textures and images for networks: exposure, colour cast, roots, resizing and head pose."""
 
-Preparation comprises exposure, colour cast, roots, resizing and head pose.
-"""
-
-import json
-import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
-from functools import cache
-from typing import Annotated, Any, ClassVar, Self, TypeVar
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import torch
 import torch.nn.functional as F
-from pydantic import Field, TypeAdapter
-from torch import Tensor, nn
+from torch import Tensor
 
-from facerf_cli.run.logs import LOGGER_NAME
-
-log = logging.getLogger(LOGGER_NAME)
 MEAN_RADIANCE = 0.25  # of the visible face after division by its exposure
 _ROOT_OFFSET = 0.02  # keeps the slope of the root finite at black
 _ORDINARY_CAST = 2.0  # standard deviations; smaller colour casts are left to the network
-_BF16_CAPABILITY = 8  # least compute capability of an NVIDIA GPU with bfloat16
-_NAMES = {"cpu": "processor", "cuda": "GPU"}
 _GREY = 1e-4  # difference of a grey image's channels relative to its mean, caused by resampling
 _LEAST_DEVIATION = 0.02  # of a log ratio of colours, because grey data have none
 
@@ -148,110 +135,3 @@ def head_rotation(mean_normals: Tensor, normals: Tensor) -> Tensor:
     signs = moment.new_ones(len(moment), 3)
     signs[:, 2] = torch.det(u @ vt)
     return (u @ torch.diag_embed(signs) @ vt).to(normals)
-
-
-class Down(nn.Module):
-    """Halve the side (unless `first`), then apply a residual convolution."""
-
-    def __init__(self, channels_in: int, channels_out: int, first: bool = False, groups: int = 4) -> None:
-        super().__init__()
-        self.enter = nn.Conv2d(channels_in, channels_out, 3, stride=1 if first else 2, padding=1)
-        self.norm = nn.GroupNorm(groups, channels_out)
-        self.inner = nn.Conv2d(channels_out, channels_out, 3, padding=1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Map features [B, C, H, W] to [B, C', H / 2, W / 2], or to the same side."""
-        x = F.silu(self.norm(self.enter(x)))
-        result: Tensor = x + F.silu(self.inner(x))
-        return result
-
-
-Count = Annotated[int, Field(ge=1, le=4096)]
-Side = Annotated[int, Field(ge=8, le=4096)]  # pixels or texels
-Grid = Annotated[int, Field(ge=1, le=64)]
-VggWidth = Annotated[float, Field(gt=0, le=4)]  # relative to the channels of VGG-16
-Landmarks = Annotated[int, Field(ge=68, le=256)]
-Classes = Annotated[int, Field(ge=2, le=256)]
-Widths = Annotated[tuple[Count, ...], Field(min_length=1, max_length=12)]
-WidthsOfFour = Annotated[  # for group normalisation
-    tuple[Annotated[int, Field(ge=4, le=512, multiple_of=4)], ...], Field(min_length=3, max_length=6)
-]
-Blocks = Annotated[tuple[Annotated[int, Field(ge=0, le=8)], ...], Field(min_length=3, max_length=6)]
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Base of dataclasses whose fields are tensors [B, ...] or other batches."""
-
-    def each(self, function: Callable[[Tensor], Tensor]) -> Self:
-        """Apply a function to every tensor."""
-        values = (getattr(self, field.name) for field in fields(self))
-        return type(self)(*(x.each(function) if isinstance(x, Batch) else function(x) for x in values))
-
-    def to(self, device: torch.device) -> Self:
-        """Copy all tensors to `device`; from pinned memory, a GPU copies them asynchronously."""
-        return self.each(lambda values: values.to(device, non_blocking=device.type == "cuda"))
-
-    def pin_memory(self) -> Self:
-        """Return a copy in pinned memory; the data loader calls this."""
-        return self.each(torch.Tensor.pin_memory)
-
-    def parts(self, count: int) -> list[Self]:
-        """Split the samples into `count` batches of the same size."""
-        return [self.each(lambda values: values.chunk(count)[part]) for part in range(count)]  # noqa: B023
-
-
-Samples = TypeVar("Samples", bound=Batch)
-
-
-def concatenate(samples: Sequence[Samples]) -> Samples:
-    """Join samples into a batch."""
-    parts = [[getattr(sample, field.name) for sample in samples] for field in fields(samples[0])]
-    return type(samples[0])(*(concatenate(x) if isinstance(x[0], Batch) else torch.cat(x) for x in parts))
-
-
-class SavedNetwork(nn.Module):
-    """Network described in a checkpoint by its form and its settings."""
-
-    form: ClassVar[str] = "default"
-    kind_of_settings: ClassVar[type[Any]]  # a dataclass
-
-    def __init__(self, settings: Any) -> None:
-        super().__init__()
-        self.settings = settings
-
-    def as_metadata(self) -> dict[str, Any]:
-        """Return form and settings, for a checkpoint."""
-        return {"form": self.form, **asdict(self.settings)}
-
-    @classmethod
-    def from_metadata(cls, metadata: Mapping[str, Any]) -> Self:
-        """Make an untrained network; raises TypeError or ValueError for invalid settings."""
-        kind = cls.kind_of_settings
-        known = {field.name for field in fields(kind)}
-        settings = {name: value for name, value in metadata.items() if name != "form" or name in known}
-        if unknown := sorted(settings.keys() - known):
-            raise TypeError(f"a network of this form has no {', '.join(unknown)}")
-        # from JSON, because strict pydantic accepts its lists as tuples
-        return cls(TypeAdapter(kind).validate_json(json.dumps(settings), strict=True))
-
-
-def mixed_precision(device: torch.device, wanted: bool) -> torch.autocast:
-    """Return a context for bfloat16 computations, if that is `wanted`.
-
-    Processors without bfloat16 instructions emulate them a hundred times more slowly, and old GPUs lack them.
-    There the network stays in float32, which is logged once.
-    """
-    return torch.autocast(device.type, torch.bfloat16, enabled=wanted and _has_bf16(device))
-
-
-@cache  # logged once
-def _has_bf16(device: torch.device) -> bool:
-    has: bool = device.type not in ("cpu", "cuda")
-    if device.type == "cpu":
-        has = torch.ops.mkldnn._is_mkldnn_bf16_supported()
-    if device.type == "cuda":
-        has = torch.cuda.get_device_capability(device)[0] >= _BF16_CAPABILITY
-    if not has:
-        log.info("this %s has no instructions for bfloat16; networks stay in float32", _NAMES[device.type])
-    return has

@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from facerf_cli.network.inputs import Blocks, Classes, Landmarks, SavedNetwork, Side, WidthsOfFour
+from facerf_cli.network.base import Blocks, Classes, Landmarks, SavedNetwork, Side, WidthsOfFour
 
 _ALPHA_STEPS = 2  # pixels of the classes per pixel of the features, in each direction
 

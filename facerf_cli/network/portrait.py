@@ -19,7 +19,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from facerf_cli.light.sh import mirror_signs, sh_basis
-from facerf_cli.network.inputs import MEAN_RADIANCE, Batch, Blocks, Classes, Side, WidthsOfFour
+from facerf_cli.network.base import Blocks, Classes, Side, WidthsOfFour
+from facerf_cli.network.batch import Batch
+from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.network.parsing import Residual, UNet
 from facerf_cli.raster.texture import smoothstep
 

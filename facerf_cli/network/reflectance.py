@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from facerf_cli.network.inputs import SavedNetwork
+from facerf_cli.network.base import SavedNetwork
 
 _DECODER_CHANNELS = 220  # that a decoder holds at once for each light, at its working side
 _TEXTURE_CHANNELS = 16  # that its output holds at once for each light, at the texture's side

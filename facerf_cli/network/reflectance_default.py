@@ -13,16 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from facerf_cli.network.inputs import (
-    Count,
-    Down,
-    Side,
-    Widths,
-    exposure_of,
-    from_root,
-    head_rotation,
-    resize,
-)
+from facerf_cli.network.base import Count, Down, Side, Widths
+from facerf_cli.network.inputs import exposure_of, from_root, head_rotation, resize
 from facerf_cli.network.reflectance import ReflectanceNetwork
 
 _MAP_SIDE = 64  # of the stored normals and shadows of the mean face

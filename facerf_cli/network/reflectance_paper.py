@@ -20,14 +20,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from facerf_cli.network.inputs import (
-    Count,
-    Side,
-    Widths,
-    exposure_of,
-    resize,
-    to_root,
-)
+from facerf_cli.network.base import Count, Side, Widths
+from facerf_cli.network.inputs import exposure_of, resize, to_root
 from facerf_cli.network.reflectance import ReflectanceNetwork
 
 _SLOPE = 0.2  # of the leaky rectifiers

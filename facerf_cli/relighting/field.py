@@ -16,7 +16,8 @@ from facerf_cli.face.topology import interior_texture, region_mask
 from facerf_cli.light.estimate import LightEvidence
 from facerf_cli.light.light import PointLights
 from facerf_cli.light.sphere import rig_directions
-from facerf_cli.network.inputs import is_grey, mixed_precision, without_cast
+from facerf_cli.network.base import mixed_precision
+from facerf_cli.network.inputs import is_grey, without_cast
 from facerf_cli.network.reflectance import ReflectanceNetwork
 from facerf_cli.portrait.correction import Quotient
 from facerf_cli.raster.texture import bake_attributes

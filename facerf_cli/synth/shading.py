@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.network.inputs import Batch
+from facerf_cli.network.batch import Batch
 
 LOBES = ((1.0, 0.75), (0.55, 0.25))  # skin: (roughness factor, weight) of a broad and of a narrow, oily lobe
 _NORMAL_VARIANCE = 0.18  # largest addition to alpha squared where normals vary within a facet

@@ -15,8 +15,9 @@ from torch import Tensor
 from facerf_cli.dataset.faces import DatasetFaces, SampleCrops
 from facerf_cli.light.sh import rig_coefficients
 from facerf_cli.light.sphere import RigLight
+from facerf_cli.network.batch import Batch
 from facerf_cli.network.diffuse_sh import ORDER, DiffuseEstimate, DiffuseNetwork, shading
-from facerf_cli.network.inputs import Batch, to_root
+from facerf_cli.network.inputs import to_root
 from facerf_cli.synth.bank.texture_samples import Sample, SampleSource
 from facerf_cli.training.losses import clipped_si_mse, root_loss
 from facerf_cli.training.objective import Objective

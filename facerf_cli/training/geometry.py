@@ -15,8 +15,8 @@ from torch import Tensor, nn
 from facerf_cli.face.fit import FitSettings
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import CONTOUR, OUTER_EYE_CORNERS
+from facerf_cli.network.batch import concatenate
 from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometryNetworkSettings
-from facerf_cli.network.inputs import concatenate
 from facerf_cli.raster.camera import crop_camera, project
 from facerf_cli.synth.bank.face_crops import FaceCrops, RenderedFaces
 from facerf_cli.training.objective import Objective, PeopleObjective, Validation

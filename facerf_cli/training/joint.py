@@ -41,9 +41,10 @@ from facerf_cli.face.topology import (
     on_device,
     silhouette_ids,
 )
+from facerf_cli.network.batch import Batch, concatenate
 from facerf_cli.network.features import FEATURE_LAYERS, TrainedFeatures, VggFeatures, layer_powers
 from facerf_cli.network.geometry import GeometryEstimate
-from facerf_cli.network.inputs import Batch, SourceColours, concatenate, resize, without_cast
+from facerf_cli.network.inputs import SourceColours, resize, without_cast
 from facerf_cli.network.vgg import VGG16_LICENCE, load_vgg
 from facerf_cli.raster.camera import Camera, crop_camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize

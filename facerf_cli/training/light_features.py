@@ -18,8 +18,9 @@ from facerf_cli.dataset.crops import CropPairs, open_pairs, spread_pairs
 from facerf_cli.dataset.dataset import Dataset, provenance_of
 from facerf_cli.dataset.faces import DatasetFaces, LightTextures, LitCrops
 from facerf_cli.face.morphable import MorphableModel, load_face_model
+from facerf_cli.network.batch import concatenate
 from facerf_cli.network.features import AppearanceNetwork, LightNetwork
-from facerf_cli.network.inputs import concatenate, head_rotation, resize
+from facerf_cli.network.inputs import head_rotation, resize
 from facerf_cli.synth.bank.texture_samples import SampleSource
 from facerf_cli.training.objective import Objective, PeopleObjective, Validation
 from facerf_cli.training.run import Run

@@ -29,8 +29,8 @@ from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.files.workarounds import read_in_one_thread
+from facerf_cli.network.batch import Batch
 from facerf_cli.network.checkpoint import load_networks, save_networks
-from facerf_cli.network.inputs import Batch
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.training.objective import INPUTS, Objective, seeded
 from facerf_cli.training.processes import (

@@ -8,7 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from facerf_cli.network.inputs import Batch, SourceColours, concatenate, mixed_precision
+from facerf_cli.network.base import mixed_precision
+from facerf_cli.network.batch import Batch, concatenate
+from facerf_cli.network.inputs import SourceColours
 
 # Entries of a checkpoint's metadata that say what its networks expect at test time (`models.py`).
 INPUTS = ("source_colours", "geometry", "texture_side", "crop_px")

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from facerf_cli.face.topology import OUTER_EYE_CORNERS
 from facerf_cli.image.colour import srgb_to_linear
-from facerf_cli.network.inputs import concatenate
+from facerf_cli.network.batch import concatenate
 from facerf_cli.network.parsing import Parsing, ParsingNetwork
 from facerf_cli.portrait.parse import CLASSES
 from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits

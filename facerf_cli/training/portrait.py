@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from facerf_cli.dataset.portraits import open_dataset_portraits
-from facerf_cli.network.inputs import Batch, concatenate
+from facerf_cli.network.batch import Batch, concatenate
 from facerf_cli.network.portrait import PortraitMaps, PortraitNetwork
 from facerf_cli.portrait.parse import class_index
 from facerf_cli.synth.bank.portrait_samples import (

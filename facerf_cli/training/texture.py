@@ -13,16 +13,10 @@ from torch import Tensor
 
 from facerf_cli.dataset.faces import DatasetFaces, SampleCrops
 from facerf_cli.errors import InputError
+from facerf_cli.network.batch import Batch, concatenate
 from facerf_cli.network.checkpoint import new_network
 from facerf_cli.network.features import LightNetwork, feature_distance
-from facerf_cli.network.inputs import (
-    Batch,
-    SourceColours,
-    concatenate,
-    from_root,
-    mean_colours,
-    without_cast,
-)
+from facerf_cli.network.inputs import SourceColours, from_root, mean_colours, without_cast
 from facerf_cli.synth.bank.texture_samples import Sample, SampleSource
 from facerf_cli.training.losses import clipped_si_mse, root_loss
 from facerf_cli.training.objective import (

@@ -17,8 +17,9 @@ from facerf_cli.dataset.weights import envmap_names
 from facerf_cli.errors import InputError
 from facerf_cli.face.fit import load_fit
 from facerf_cli.face.topology import grid_triangles
+from facerf_cli.network.batch import concatenate
 from facerf_cli.network.checkpoint import load_networks
-from facerf_cli.network.inputs import MEAN_RADIANCE, concatenate
+from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from facerf_cli.raster.texture import normal_map, unwrap
 from facerf_cli.synth.bank.texture_samples import Sample

@@ -23,7 +23,7 @@ from facerf_cli.dataset.weights import envmap_names, map_directions, read_envmap
 from facerf_cli.files.olat_stack import read_olat_header
 from facerf_cli.files.write import write_exr
 from facerf_cli.light.envmap import envmap_weights
-from facerf_cli.network.inputs import concatenate
+from facerf_cli.network.batch import concatenate
 from facerf_cli.synth.sky.skies import ProceduralMaps
 from facerf_cli.training.objective import seeded
 from tests.dataset.dataset_fixture import write_small_dataset

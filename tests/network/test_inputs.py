@@ -1,12 +1,9 @@
-"""Casts of light are taken off strange photos; mixed precision where it is wanted and possible."""
-
-import logging
+"""Casts of light are taken off strange photos."""
 
 import pytest
 import torch
 
-from facerf_cli.network import inputs
-from facerf_cli.network.inputs import SourceColours, colour_cast, mixed_precision
+from facerf_cli.network.inputs import SourceColours, colour_cast
 
 TRAINED = SourceColours((0.318, -0.214), ((0.094, -0.038), (-0.038, 0.081)))  # of the shipped checkpoint
 SKIN = torch.tensor([0.5, 0.36, 0.28])
@@ -55,24 +52,3 @@ def test_a_stranger_light_leaves_no_more_of_itself_and_black_stays_black() -> No
     assert left == sorted(left, reverse=True)
     texture, visible = torch.zeros(1, 3, 4, 4), torch.ones(1, 1, 4, 4)
     assert not (texture / colour_cast(texture, visible, TRAINED)).any()
-
-
-CPU = torch.device("cpu")
-
-
-@pytest.fixture(autouse=True)
-def _fresh() -> None:
-    inputs._has_bf16.cache_clear()
-
-
-@pytest.mark.parametrize(("wanted", "has"), [(True, True), (True, False), (False, True)])
-def test_bfloat16_needs_the_wish_and_the_instructions(
-    wanted: bool, has: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setattr(torch.ops.mkldnn, "_is_mkldnn_bf16_supported", lambda: has, raising=False)
-    caplog.set_level(logging.INFO)
-    layer, x = torch.nn.Linear(2, 2), torch.ones(1, 2)
-    for _ in range(2):
-        with mixed_precision(CPU, wanted):
-            assert layer(x).dtype is (torch.bfloat16 if wanted and has else torch.float32)
-    assert len(caplog.messages) == (wanted and not has)

@@ -9,8 +9,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from facerf_cli.network.batch import concatenate
 from facerf_cli.network.features import LightNetwork, LightSettings
-from facerf_cli.network.inputs import colour_cast, concatenate
+from facerf_cli.network.inputs import colour_cast
 from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from facerf_cli.network.reflectance_paper import PaperReflectanceNetwork, PaperReflectanceSettings
 from facerf_cli.synth.bank.heads import Bank

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import GRID, MIRROR_68
-from facerf_cli.network.inputs import Batch
+from facerf_cli.network.batch import Batch
 from facerf_cli.synth.bank import split_people
 from facerf_cli.synth.bank.people import photos_in, read_photo
 from facerf_cli.synth.camera import Similarity, SimulatedCamera, background, occluder, recoloured, resample

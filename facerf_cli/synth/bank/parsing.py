@@ -20,7 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from facerf_cli.image.colour import linear_to_srgb
-from facerf_cli.network.inputs import Batch
+from facerf_cli.network.batch import Batch
 from facerf_cli.portrait.parse import class_index
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.raster.texture import texel_centres_uv

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.light.sphere import direction_to_azel
-from facerf_cli.network.inputs import MEAN_RADIANCE, Batch
+from facerf_cli.network.batch import Batch
+from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.network.portrait import SKIN, PortraitInputs, mirrored_x, reached_by
 from facerf_cli.portrait.person import SIDES
 from facerf_cli.portrait.proxy import own_shading

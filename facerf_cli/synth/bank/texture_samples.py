@@ -15,7 +15,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from facerf_cli.face.topology import GRID, UV_SIZE_MM, grid_triangles
-from facerf_cli.network.inputs import MEAN_RADIANCE, Batch
+from facerf_cli.network.batch import Batch
+from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.raster.texture import bake_attributes, inpaint, normal_map, texel_centres_uv
 from facerf_cli.synth.appearance.skin import draw_skin
 from facerf_cli.synth.random_fields import LANDMARK_MM, Uniform, Window, mask, noise, places_mm, smooth
