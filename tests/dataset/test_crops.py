@@ -18,6 +18,7 @@ from facerf_cli.dataset.crops import (
     spread_pairs,
 )
 from facerf_cli.dataset.dataset import Dataset
+from facerf_cli.dataset.faces import open_faces
 from facerf_cli.dataset.pairs import Pair, draw_pairs, load_pairs, write_pairs
 from facerf_cli.dataset.weights import envmap_names, relit_images
 from facerf_cli.errors import InputError
@@ -25,7 +26,7 @@ from facerf_cli.face.fit import load_fit
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.synth.sky.skies import ProceduralMaps
 from tests.dataset.dataset_fixture import write_small_dataset
-from tests.kinds import Folders, Patch
+from tests.kinds import Folders, Log, Patch
 from tests.refusals import refused
 from tests.stacks import read_olat_stack
 
@@ -154,9 +155,13 @@ def test_a_stack_gives_the_sources_of_many_steps(reader: PairReader, monkeypatch
     )  # of many pairs, each moved in its own way
 
 
-def test_the_only_person_is_validated_on_and_a_split_without_pairs_is_named(tmp_path: Path) -> None:
+def test_the_only_person_is_validated_on_and_a_split_without_pairs_is_named(
+    tmp_path: Path, caplog: Log
+) -> None:
     dataset = write_small_dataset(tmp_path, counts=(1, 0, 0), cameras=1, lights=8, crop_px=32)
     refused(InputError, "make them with `facerf relight-", open_pairs, dataset, "train", 32)
     write_pairs(dataset, draw_pairs(dataset, envmap_names(ProceduralMaps(1, 0, 32)), 2, 0), overwrite=False)
     train, validation = (open_pairs(dataset, split, 32).pairs for split in ("train", "validation"))
-    assert len(train) == 2 and validation == train
+    assert len(train) == 2 and validation == train and "only one person" in caplog.text
+    people = open_faces(dataset.folder, "builtin", 32).people(12)
+    assert [part.tolist() for part in people] == [[0], [0]]

@@ -184,12 +184,6 @@ def test_training_on_a_dataset_lowers_the_loss_and_names_it(faces: DatasetFaces,
     assert metadata["metrics"]["si_mse"] > 0 and faces.dataset.folder.name in metadata["licence"]
 
 
-def test_the_only_person_is_validated_on(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    one = write_small_dataset(tmp_path, counts=(1, 0, 0), cameras=1, lights=4, crop_px=32)
-    assert [people.tolist() for people in open_faces(one.folder, "builtin", SIDE).people(12)] == [[0], [0]]
-    assert "only one person" in caplog.text
-
-
 def test_splits_and_models_that_cannot_be_trained_on(dataset: Dataset, tmp_path: Path) -> None:
     refused(InputError, "no such face model", open_faces, dataset.folder, "nobody.npz", SIDE)
     none = write_small_dataset(tmp_path, counts=(2, 0, 0), cameras=1, lights=4, crop_px=32)

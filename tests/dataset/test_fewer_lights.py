@@ -15,13 +15,11 @@ from facerf_cli.dataset.pairs import (
     pair_weights,
     pairs_path,
     read_pairs,
-    render_source,
     weights_path,
     write_pairs,
 )
 from facerf_cli.dataset.weights import envmap_names, map_directions, read_envmap
 from facerf_cli.files.olat_stack import read_olat_header
-from facerf_cli.files.write import write_exr
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.network.batch import concatenate
 from facerf_cli.synth.sky.skies import ProceduralMaps
@@ -75,16 +73,6 @@ def test_a_map_is_weighed_over_the_cells_of_the_lights_there_are(dataset: Datase
             torch.testing.assert_close(expected.sum(0), everything)  # no light of the map is lost
     stored = np.load(weights_path(here))
     assert stored.shape[1] == LIGHTS and (stored[:4, 17:] == 0).all() and (stored[8:, 17:] > 0).any()
-
-
-def test_a_constant_map_gives_the_fully_lit_image(dataset: Dataset, tmp_path: Path) -> None:
-    here = fresh(dataset, tmp_path)
-    write_exr(tmp_path / "white.exr", np.ones((5, 10, 3), np.float32))
-    pairs = write_pairs(here, draw_pairs(here, [str(tmp_path / "white.exr")], 1, 0), overwrite=False)
-    for pair in pairs:
-        lit = read_olat_header(here.stack_path(pair.subject, pair.source_camera)).source
-        image = render_source(here, pair).permute(1, 2, 0).float().numpy()
-        np.testing.assert_allclose(image, lit, atol=0.01 * lit.max())
 
 
 def test_they_train_beside_those_who_have_all(dataset: Dataset, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from facerf_cli.training.diffuse_sh import (
     sum_lights,
 )
 from facerf_cli.training.objective import seeded
+from tests.training.alone import assert_samples_are_alone
 
 NETWORK = DiffuseSettings(32, (8, 12, 16), (8, 12, 16), 4, 4, 16)
 SETTINGS = SumSettings(lights=4, sums=2, held_out_people=2, held_out_draws=2)
@@ -51,15 +52,7 @@ def test_a_sample_depends_on_no_neighbour_and_the_source_teaches_the_light_alone
     assert network.albedo.weight.grad is None and network.light[-1].weight.grad.abs().sum() > 0
     stage(batch)["targets"].backward()
     assert network.albedo.weight.grad.abs().sum() > 0
-    stage = objective(bank)
-    whole = stage.draw(3, lambda i: seeded(1, i), 0)
-    part = stage.draw(1, lambda i: seeded(1, i + 2), 0)
-    assert torch.equal(whole.sample.target[2:], part.sample.target)
-    assert torch.equal(whole.weights[2:], part.weights)
-    assert torch.equal(whole.coefficients[2:], part.coefficients)
-    terms = [stage(stage.draw(1, lambda i, k=k: seeded(1, k), 0)) for k in range(3)]
-    for name, value in stage(whole).items():
-        assert torch.allclose(value, torch.stack([t[name] for t in terms]).mean(), rtol=1e-4)
+    assert_samples_are_alone(objective(bank))
 
 
 def test_an_albedo_lit_by_lambert_in_a_dome_is_explained_exactly() -> None:

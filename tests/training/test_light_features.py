@@ -9,7 +9,6 @@ from facerf_cli.dataset.faces import open_faces
 from facerf_cli.face.topology import grid_triangles
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.network.features import LightNetwork, LightSettings
-from facerf_cli.network.inputs import head_rotation
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.raster.texture import unwrap
 from facerf_cli.synth.bank.heads import Bank
@@ -19,6 +18,7 @@ from facerf_cli.training.objective import seeded
 from facerf_cli.training.texture import PeopleSettings
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.toy_faces import ToyFaces
+from tests.training.alone import assert_samples_are_alone
 
 SETTINGS = PeopleSettings(lights=4, held_out_people=2, held_out_draws=3)
 
@@ -47,13 +47,7 @@ def test_training_lowers_the_loss_and_finds_lights_of_held_out_heads(bank: Bank)
 
 
 def test_a_sample_does_not_depend_on_its_neighbours(bank: Bank) -> None:
-    stage = objective(bank)
-    whole = stage.draw(3, lambda i: seeded(1, i), 0)
-    part = stage.draw(1, lambda i: seeded(1, i + 2), 0)
-    assert torch.equal(whole.textures[2:], part.textures)
-    assert torch.equal(whole.lights_head[2:], part.lights_head)
-    terms = [stage(stage.draw(1, lambda i, k=k: seeded(1, k), 0))["light"] for k in range(3)]
-    assert torch.allclose(stage(whole)["light"], torch.stack(terms).mean())
+    assert_samples_are_alone(objective(bank))
 
 
 def test_lights_are_unit_vectors_in_the_frame_of_the_head(bank: Bank) -> None:
@@ -91,7 +85,7 @@ def test_the_crops_of_a_stack_give_its_textures(tmp_path: Path) -> None:
     assert stage(drawn)["light"].item() > 0 and "angle_deg" in stage.validate().metrics
 
 
-def test_cameras_cast_colours_and_turns_are_found_from_normals() -> None:
+def test_cameras_cast_colours() -> None:
     matrices = torch.stack([camera_matrix(seeded(draw)) for draw in range(400)])
     grey = matrices[:, 0, 1] > 0
     cast, mixed = matrices[~grey], matrices[grey]
@@ -100,12 +94,6 @@ def test_cameras_cast_colours_and_turns_are_found_from_normals() -> None:
     assert torch.equal(mixed, mixed[:, :1].expand_as(mixed)), "a row for all channels"
     balance = matrices.sum(1).log()
     assert balance.abs().max() < 0.121 and balance.std() > 0.05
-    mean = torch.nn.functional.normalize(
-        torch.randn(3, 8, 8) + torch.tensor([0, 0, 2.0]).view(3, 1, 1), dim=0
-    )
-    turn = pose_to_rotation(30.0, -10.0, 5.0)
-    turned = torch.einsum("dc,cij->dij", turn, mean)
-    assert torch.allclose(head_rotation(mean, turned[None])[0], turn, atol=1e-5)
 
 
 def test_directions_are_learnt_in_the_frame_of_the_head() -> None:

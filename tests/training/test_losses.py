@@ -2,18 +2,15 @@ import math
 
 import pytest
 import torch
-from torch import Tensor
 
-from facerf_cli.network.features import VggFeatures, feature_distance, layer_powers
+from facerf_cli.network.features import VggFeatures
 from facerf_cli.network.inputs import from_root, to_root
 from facerf_cli.training.losses import (
     Features,
     MaskedPair,
-    PaperWeights,
     clipped_si_mse,
     landmark_loss,
     photometric_loss,
-    regularisation,
     root_loss,
     si_mse,
     slid_contour,
@@ -51,27 +48,6 @@ def test_roots_are_undone_exactly_and_glints_beyond_white_clipped() -> None:
     target[..., 3, 3], prediction[..., 3, 3] = 30.0, 3.0
     assert clipped_si_mse(prediction, target, weight).item() < 1e-10
     assert si_mse(prediction, target, weight).item() > 1
-
-
-def test_weights_are_the_papers_and_regularisation_their_weighed_mean() -> None:
-    weights = PaperWeights()
-    assert (weights.landmarks, weights.photometric, weights.regularisation, weights.features) == (25, 5, 1, 1)
-    assert (weights.alpha, weights.beta) == (0.4, 0.002)
-    alpha, beta = torch.randn(3, 40), torch.randn(3, 29)
-    for face, value in enumerate(regularisation(alpha, beta).tolist()):
-        by_hand = 0.4 * sum(a * a for a in alpha[face].tolist()) / 40
-        by_hand += 0.002 * sum(b * b for b in beta[face].tolist()) / 29
-        assert value == pytest.approx(by_hand, rel=1e-5)
-
-
-@pytest.mark.parametrize("side_px", [64, 512])
-def test_landmarks_are_in_half_sides(side_px: int) -> None:
-    found, detected = torch.rand(2, 66, 2) * side_px, torch.rand(2, 66, 2) * side_px
-    for face, value in enumerate(landmark_loss(found, detected, side_px).tolist()):
-        total = 0.0
-        for a, b in zip(found[face].tolist(), detected[face].tolist(), strict=True):
-            total += sum(((p - q) / (side_px / 2)) ** 2 for p, q in zip(a, b, strict=True))
-        assert value == pytest.approx(total / 66, rel=1e-4)
 
 
 def test_the_contour_slides_to_the_closest_candidates_and_with_the_mesh() -> None:
@@ -123,24 +99,6 @@ def _seen(side: int) -> MaskedPair:
     mask = torch.zeros(2, 1, side, side)
     mask[..., 2:-2] = 1
     return MaskedPair(torch.rand(2, 3, side, side).requires_grad_(), torch.rand(2, 3, side, side), mask)
-
-
-def test_features_are_of_masked_images_and_their_powers_mean_squares(net: VggFeatures) -> None:
-    image, texture = _seen(24), _seen(16)
-    expected: Tensor = torch.zeros(2)
-    for seen in (image, texture):
-        one, other = seen.prediction * seen.mask, seen.target * seen.mask
-        layers = zip(net.layers(one), net.layers(other), POWERS, strict=True)
-        expected = expected + sum(((a - b) ** 2).mean((1, 2, 3)) / power for a, b, power in layers)
-    features = Features(net, POWERS)
-    assert torch.allclose(image.distance(features) + texture.distance(features), expected, rtol=1e-4)
-    masked = texture.prediction * texture.mask, texture.target * texture.mask
-    assert torch.allclose(texture.distance(features), feature_distance(net, *masked, POWERS))
-    ones = torch.ones(3)
-    assert torch.allclose(feature_distance(net, *masked), feature_distance(net, *masked, ones))
-    images = torch.rand(4, 3, 16, 16)
-    wanted = torch.stack([layer.square().mean() for layer in net.layers(images)])
-    torch.testing.assert_close(layer_powers(net, images), wanted)
 
 
 def test_features_pull_the_prediction_within_the_mask_alone(net: VggFeatures) -> None:

@@ -10,7 +10,7 @@ from facerf_cli.network.parsing import Parsing, ParsingNetwork
 from facerf_cli.portrait.parse import CLASSES, LANDMARKS, class_index
 from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
 from facerf_cli.training.parsing import ParsingObjective
-from tests.training.toy_parsing import SETTINGS, SIDE, TINY, Portraits, truth
+from tests.training.toy_parsing import SETTINGS, SIDE, Portraits, truth
 
 
 def seen(batch: PortraitCrops, sure: float = 30.0) -> Parsing:
@@ -98,19 +98,3 @@ def test_a_soft_edge_is_best_met_by_its_own_share() -> None:
         return found["classes"] + found["matte"]
 
     assert cost(0.3) < min(cost(0.2), cost(0.4))
-
-
-def test_the_loss_of_a_real_network_falls() -> None:
-    torch.manual_seed(0)
-    portraits = cast(StoredPortraits, Portraits())
-    objective = ParsingObjective(portraits, ParsingNetwork(TINY), SETTINGS)
-    batch = truth(32)
-    optimizer = torch.optim.Adam(objective.parameters(), 3e-3)
-    losses = []
-    for _ in range(30):
-        loss = torch.stack(list(objective(batch).values())).sum()
-        optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        optimizer.step()
-        losses.append(loss.item())
-    assert losses[-1] < losses[0] - 1

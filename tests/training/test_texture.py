@@ -1,6 +1,4 @@
-import json
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,45 +7,24 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from facerf_cli.network.batch import concatenate
 from facerf_cli.network.features import LightNetwork, LightSettings
 from facerf_cli.network.inputs import colour_cast
 from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
-from facerf_cli.network.reflectance_paper import PaperReflectanceNetwork, PaperReflectanceSettings
 from facerf_cli.synth.bank.heads import Bank
 from facerf_cli.synth.bank.texture_samples import Sample
-from facerf_cli.training.loop import train
 from facerf_cli.training.losses import root_loss
 from facerf_cli.training.objective import seeded
-from facerf_cli.training.settings import PRESETS
 from facerf_cli.training.texture import TextureObjective, TextureObjectiveSettings
 from tests.toy_faces import SIDE, ToyFaces, toy_objective
+from tests.training.alone import assert_samples_are_alone
 
 NETWORK = DefaultReflectanceSettings(
     side=32, encoder_widths=(8, 12, 16), decoder_widths=(8, 12, 16), template_channels=2, rig_lights=20
 )
 
 
-def test_training_on_the_bank_lowers_the_loss(bank: Bank, tmp_path: Path) -> None:
-    settings = TextureObjectiveSettings(lights=3, held_out_people=2, held_out_draws=2)
-    objective = TextureObjective(bank, DefaultReflectanceNetwork(NETWORK), settings=settings)
-    train(objective, tmp_path, replace(PRESETS["tiny"], steps=60))
-    rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
-    losses = torch.tensor([row["loss"] for row in rows])
-    assert losses[-10:].mean() < 0.9 * losses[:10].mean()
-    assert rows[-1]["validation"]["si_mse"] < rows[9]["validation"]["si_mse"]
-
-
-def test_a_sample_depends_on_no_neighbour_and_a_batch_is_the_mean_of_its_halves() -> None:
-    objective = toy_objective()
-    whole = objective.draw(4, lambda i: seeded(5, i), 1)
-    halves = [objective.draw(2, lambda i, first=first: seeded(5, first + i), 1) for first in (0, 2)]
-    joined = concatenate([half.sample for half in halves])
-    assert torch.equal(whole.sample.target, joined.target) and torch.equal(whole.sample.source, joined.source)
-    assert whole.people.tolist() == [person for half in halves for person in half.people.tolist()]
-    assert len(set(whole.people.tolist())) > 1
-    mean = torch.stack([objective(half)["root"] for half in halves]).mean()
-    assert torch.allclose(objective(whole)["root"], mean, rtol=1e-6)
+def test_a_sample_depends_on_no_neighbour() -> None:
+    assert_samples_are_alone(toy_objective())
 
 
 def test_validation_measures_the_same_samples_every_time_and_tells_the_poses_apart(bank: Bank) -> None:
@@ -73,16 +50,6 @@ def test_the_loss_on_features_pulls_the_prediction_toward_the_target() -> None:
     gradients = [parameter.grad for parameter in objective.networks.parameters()]
     assert any(gradient is not None and float(gradient.abs().max()) > 0 for gradient in gradients)
     assert "light" not in objective.networks
-
-
-def test_the_papers_form_trains_on_textures(tmp_path: Path) -> None:
-    network = PaperReflectanceNetwork(PaperReflectanceSettings(16, (8, 8), 8))
-    objective = TextureObjective(
-        ToyFaces(), network, settings=TextureObjectiveSettings(lights=2, held_out_people=3)
-    )
-    loss = objective(objective.draw(2, lambda i: seeded(1, i), 1))["root"]
-    loss.backward()
-    assert loss.isfinite() and all(p.grad is not None for p in network.parameters())
 
 
 @pytest.mark.parametrize("normals", [True, False])
