@@ -25,7 +25,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from facerf_cli.dataset.dataset import PREPARE_AGAIN, Dataset, people_of, read_stack
-from facerf_cli.dataset.pairs import Pair, load_pairs
+from facerf_cli.dataset.pairs import Pair, load_pairs, sum_sources
 from facerf_cli.dataset.weights import relit_images
 from facerf_cli.errors import InputError
 from facerf_cli.face.fit import FaceFit, load_fit
@@ -142,7 +142,7 @@ class PairReader:
             of_stack = self._by_stack[_source_stack(any_pair)]
             places = torch.randint(len(of_stack), (_SOURCES_EACH,), generator=generator).tolist()
             pairs = [of_stack[place] for place in places]
-            return list(zip(pairs, self._sum_sources(pairs), strict=True))
+            return list(zip(pairs, sum_sources(self.dataset, pairs), strict=True))
         subject = self.subjects[int(torch.randint(len(self.subjects), (), generator=generator))]
         cameras = self.dataset.cameras[subject]
         camera = cameras[int(torch.randint(len(cameras), (), generator=generator))]
@@ -162,13 +162,6 @@ class PairReader:
         light = int(draw_target_lights(directions, 1, generator))
         return Pair(subject, 0, self.dataset.split_of(subject), camera, "", 0.0, 0, target, light)
 
-    def _sum_sources(self, pairs: Sequence[Pair]) -> list[Tensor]:
-        """Sum the sources [3, H, W] float16 of pairs of one stack."""
-        rows, weights = load_pairs(self.dataset)[pairs[0].subject]
-        places = {row.index: place for place, row in enumerate(rows)}
-        chosen = torch.from_numpy(np.array(weights[[places[pair.index] for pair in pairs]]))
-        return list(relit_images(self.dataset.stack_path(*_source_stack(pairs[0])), chosen))
-
     def draw(self, count: int, generator_of: Callable[..., torch.Generator], step: int) -> CropPairs:
         """Draw random pairs, each crop as a detector's box would cut it (see `Objective.draw`)."""
         drawn = []
@@ -184,7 +177,7 @@ class PairReader:
             self._crop(pair, source.float(), UNMOVED, UNMOVED)
             for _, of_stack in groupby(pairs, _source_stack)
             for pairs_of_stack in [list(of_stack)]
-            for pair, source in zip(pairs_of_stack, self._sum_sources(pairs_of_stack), strict=True)
+            for pair, source in zip(pairs_of_stack, sum_sources(self.dataset, pairs_of_stack), strict=True)
         ]
 
     def read_target(self, pair: Pair, move: CropMove = UNMOVED) -> Tensor:
@@ -218,7 +211,9 @@ class PairReader:
             stacks = list(self._by_stack.values())
             some = stacks[:: math.ceil(len(stacks) / _STACKS_MEASURED)]
             parts = [pairs[: math.ceil(count / len(some))] for pairs in some]
-            sources = [pair for part in parts for pair in zip(part, self._sum_sources(part), strict=True)]
+            sources = [
+                pair for part in parts for pair in zip(part, sum_sources(self.dataset, part), strict=True)
+            ]
         else:
             each = math.ceil(count / _STACKS_MEASURED)
             sources = [pair for seed in range(_STACKS_MEASURED) for pair in self.draw_sources(seed)[:each]]

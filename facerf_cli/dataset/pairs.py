@@ -5,18 +5,16 @@
     relit/SUBJECT/NNNNN.exr   the pair's source, unless the pairs are lazy
 
 A pair is a recipe: subject, camera, envmap, rotation, exposure and target. A row of weights starts with the
-weights of its subject's lights; if the subject lacks some of the rig's L, zeros follow. Weights are computed
-from the rows and the envmaps, and recomputed if the file is missing.
+weights of its subject's lights; if the subject lacks some of the rig's L, zeros follow.
 """
 
 import hashlib
 import logging
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -232,20 +230,13 @@ def _load_pairs(folder: Path, changed_ns: int) -> dict[str, tuple[list[Pair], np
 
 def _load_weights(dataset: Dataset, pairs: list[Pair]) -> np.ndarray:
     path = weights_path(dataset)
-    if not path.is_file():
-        log.info("%s: missing; recomputing the weights", path)
-        weights, computed = compute_pair_weights(dataset, pairs)
-        if computed != pairs:
-            raise InputError(
-                f"{pairs_path(dataset)}: the envmaps have changed since the pairs were made; {DRAW_AGAIN}"
-            )
-        _write_weights(dataset, weights, pairs_path(dataset).read_bytes())
     try:
         weights = np.load(path, mmap_mode="r")
         if weights.shape != (len(pairs), len(dataset.light_ids), 3) or weights.dtype != np.float32:
             raise ValueError(f"shape {weights.shape}")
     except (ValueError, OSError, EOFError) as error:
-        raise InputError(f"{path}: damaged ({error}); delete it, and it is recomputed") from None
+        what = f"damaged ({error}); delete it, and" if path.is_file() else "missing;"
+        raise InputError(f"{path}: {what} run relight-dataset again with the same options") from None
     return weights
 
 
@@ -284,17 +275,6 @@ def compute_pair_weights(
     return weights, exposed
 
 
-def pair_weights(dataset: Dataset, pair: Pair) -> Tensor:
-    """Compute the weights [L, 3] of one pair from its envmap; they equal the ones from `load_pairs`."""
-    lights = dataset.lights_of(pair.subject)
-    result = compute_weights(EnvmapTask(pair.envmap, map_directions(dataset), (pair.rotate_deg,), (lights,)))
-    if isinstance(result, str):
-        raise InputError(result)
-    if result.exposure_ev != pair.exposure_ev:
-        raise InputError(f"{pair.envmap}: the envmap has changed since the pair was made; {DRAW_AGAIN}")
-    return torch.from_numpy(result.weights[0, : len(lights)])
-
-
 def relight_subject(
     dataset: Dataset,
     pairs: list[Pair],
@@ -316,11 +296,12 @@ def relight_subject(
     return len(todo)
 
 
-def render_source(dataset: Dataset, row: Pair | Mapping[str, Any]) -> Tensor:
-    """Render the source [3, H, W] float16 of a line of pairs.jsonl from only the dataset and the envmap.
+def sum_sources(dataset: Dataset, pairs: Sequence[Pair]) -> list[Tensor]:
+    """Sum the sources [3, H, W] float16 of pairs of one subject and camera.
 
-    The result equals the file that `relight-dataset` writes, bit for bit.
+    The result equals the files that `relight-dataset` writes, bit for bit.
     """
-    pair = row if isinstance(row, Pair) else checked(Pair, row, "a line of pairs")
-    weights = pair_weights(dataset, pair)
-    return next(relit_images(dataset.stack_path(pair.subject, pair.source_camera), weights[None]))
+    rows, weights = load_pairs(dataset)[pairs[0].subject]
+    places = {row.index: place for place, row in enumerate(rows)}
+    chosen = torch.from_numpy(np.array(weights[[places[pair.index] for pair in pairs]]))
+    return list(relit_images(dataset.stack_path(pairs[0].subject, pairs[0].source_camera), chosen))

@@ -45,7 +45,7 @@ class EnvmapTask:
     name: str
     directions: Tensor  # [L, 3] of the whole rig in the envmap's axes, from `map_directions`
     rotations_deg: tuple[float, ...]
-    lights: tuple[tuple[int, ...], ...] = ()  # the rig's lights used at each rotation; () for all
+    lights: tuple[tuple[int, ...], ...]  # the rig's lights used at each rotation
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,11 +94,9 @@ def compute_weights(task: EnvmapTask) -> EnvmapResult:
 
 def _weights(envmap: Tensor, task: EnvmapTask) -> Tensor:
     """Compute weights [R, L, 3] without exposure, over the cells of each row's lights."""
-    everything = tuple(range(len(task.directions)))
-    lights = task.lights or (everything,) * len(task.rotations_deg)
-    weights = torch.zeros(len(lights), len(everything), 3)
-    for chosen in dict.fromkeys(lights):
-        rows = [row for row, other in enumerate(lights) if other == chosen]
+    weights = torch.zeros(len(task.lights), len(task.directions), 3)
+    for chosen in dict.fromkeys(task.lights):
+        rows = [row for row, other in enumerate(task.lights) if other == chosen]
         directions = task.directions[list(chosen)]
         turned = rotated_weights(envmap, directions, [task.rotations_deg[row] for row in rows])
         weights[rows, : len(chosen)] = turned

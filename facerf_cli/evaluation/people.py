@@ -14,7 +14,7 @@ from facerf_cli.baselines import RelightKind, explain_by_baseline
 from facerf_cli.baselines.base import Explained, Reflectance
 from facerf_cli.batch.inputs import Item
 from facerf_cli.dataset.dataset import Dataset
-from facerf_cli.dataset.pairs import Pair, image_path, load_pairs, pair_weights, render_source, weights_path
+from facerf_cli.dataset.pairs import Pair, image_path, load_pairs, sum_sources
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation.folders import case_of, read_facts
 from facerf_cli.evaluation.measure import Case, Comparison
@@ -254,17 +254,15 @@ class DatasetPerson:
         return ComparedFace(name, Case(name, self.name), LinearImage(image, header.seen), face, self.bench)
 
     def source(self, pair: Pair) -> np.ndarray:
-        """Read the source image [S, S, 3] of a pair, or render it if it is not stored."""
+        """Read the source image [S, S, 3] of a pair, or sum it if it is not stored."""
         path = image_path(self.dataset, *pair.key)
         if path.is_file():
             return read_image(path).pixels
-        return render_source(self.dataset, pair).permute(1, 2, 0).float().numpy()
+        return sum_sources(self.dataset, [pair])[0].permute(1, 2, 0).float().numpy()
 
     def light(self, pair: Pair) -> tuple[np.ndarray, np.ndarray]:
         """Return the true light of a pair's source: camera-space directions [L, 3] and rgb weights [L, 3]."""
         directions = self.header(pair.source_camera).directions
-        if not weights_path(self.dataset).is_file():  # load_pairs would write into the measured dataset
-            return directions, pair_weights(self.dataset, pair).numpy()
         pairs, weights = load_pairs(self.dataset)[self.name]
         return directions, np.array(weights[pairs.index(pair)])
 

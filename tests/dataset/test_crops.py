@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from facerf_cli.dataset import crops as module
+from facerf_cli.dataset import pairs
 from facerf_cli.dataset.crops import (
     UNMOVED,
     CropMove,
@@ -19,7 +19,7 @@ from facerf_cli.dataset.crops import (
 )
 from facerf_cli.dataset.dataset import Dataset
 from facerf_cli.dataset.faces import open_faces
-from facerf_cli.dataset.pairs import Pair, draw_pairs, load_pairs, write_pairs
+from facerf_cli.dataset.pairs import Pair, draw_pairs, load_pairs, sum_sources, write_pairs
 from facerf_cli.dataset.weights import envmap_names, relit_images
 from facerf_cli.errors import InputError
 from facerf_cli.face.fit import load_fit
@@ -98,7 +98,7 @@ def test_crops_are_never_enlarged_and_heads_stand_where_their_fits_say(dataset: 
 def test_a_drawn_crop_is_moved_with_its_landmarks(dataset: Dataset, reader: PairReader) -> None:
     """As far as a detector's box may be off; the content follows the landmarks."""
     pair, move = reader.pairs[0], CropMove(1.25, (0.1, -0.05))
-    (plain,), (source,) = reader.read([pair]), reader._sum_sources([pair])
+    (plain,), (source,) = reader.read([pair]), sum_sources(dataset, [pair])
     moved = reader._crop(pair, source.float(), move, UNMOVED)
     assert torch.equal(moved.target, plain.target)
     middle = torch.full((2,), CROP_PX / 2)
@@ -143,7 +143,7 @@ def test_a_stack_gives_the_sources_of_many_steps(reader: PairReader, monkeypatch
     """They are those that reading gives, whatever the step that drawing begins at."""
     opened: list[Path] = []
     monkeypatch.setattr(
-        module, "relit_images", lambda path, rows: opened.append(path) or relit_images(path, rows)
+        pairs, "relit_images", lambda path, rows: opened.append(path) or relit_images(path, rows)
     )
     first, resumed = replace(reader), replace(reader)
     drawn = [first.draw(1, _generator_of(step), step) for step in range(130)]
