@@ -20,9 +20,8 @@ from facerf_cli.network.diffuse_sh import ORDER, DiffuseEstimate, DiffuseNetwork
 from facerf_cli.network.inputs import to_root
 from facerf_cli.synth.bank.texture_samples import Sample, SampleSource
 from facerf_cli.training.losses import clipped_si_mse, root_loss
-from facerf_cli.training.objective import Objective
+from facerf_cli.training.objective import Objective, tiled
 from facerf_cli.training.run import Run
-from facerf_cli.training.sheets import tiled
 from facerf_cli.training.texture import PeopleSettings, SamplesObjective
 
 _TOTAL = 1.5  # of a sum's weights: a face lit from the front then has about the albedo's radiance

@@ -19,9 +19,17 @@ from facerf_cli.network.batch import concatenate
 from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometryNetworkSettings
 from facerf_cli.raster.camera import crop_camera, project
 from facerf_cli.synth.bank.face_crops import FaceCrops, RenderedFaces
-from facerf_cli.training.objective import Objective, PeopleObjective, Validation
+from facerf_cli.training.objective import (
+    FOUND_COLOUR,
+    TRUE_COLOUR,
+    Objective,
+    PeopleObjective,
+    Validation,
+    in_rows,
+    mark,
+    tiled,
+)
 from facerf_cli.training.run import Run
-from facerf_cli.training.sheets import FOUND_COLOUR, TRUE_COLOUR, in_rows, mark, tiled
 
 _SHEET_ROWS, _SHEET_COLUMNS, _SHEET_PX = 4, 8, 192
 

@@ -62,10 +62,9 @@ from facerf_cli.training.losses import (
     regularisation,
     slid_contour,
 )
-from facerf_cli.training.objective import Objective, Validation, seeded
+from facerf_cli.training.objective import Objective, Validation, seeded, tiled
 from facerf_cli.training.processes import broadcast_from_first, process_rank
 from facerf_cli.training.run import Run
-from facerf_cli.training.sheets import tiled
 
 FIXED_LANDMARKS = tuple(i for i in range(len(CONTOUR), 68) if i not in INNER_MOUTH_CORNERS)
 LANDMARKS = (*CONTOUR, *FIXED_LANDMARKS)  # the paper's 66 (Saragih et al., 2011), the contour's first

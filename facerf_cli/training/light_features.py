@@ -22,9 +22,8 @@ from facerf_cli.network.batch import concatenate
 from facerf_cli.network.features import AppearanceNetwork, LightNetwork
 from facerf_cli.network.inputs import head_rotation, resize
 from facerf_cli.synth.bank.texture_samples import SampleSource
-from facerf_cli.training.objective import Objective, PeopleObjective, Validation
+from facerf_cli.training.objective import Objective, PeopleObjective, Validation, tiled
 from facerf_cli.training.run import Run
-from facerf_cli.training.sheets import tiled
 from facerf_cli.training.texture import PeopleSettings
 
 _NORMALS_SIDE = 64  # texels along a side of the normals that head rotations are computed from

@@ -19,9 +19,17 @@ from facerf_cli.network.batch import concatenate
 from facerf_cli.network.parsing import Parsing, ParsingNetwork
 from facerf_cli.portrait.parse import CLASSES
 from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
-from facerf_cli.training.objective import Objective, PeopleObjective, Validation
+from facerf_cli.training.objective import (
+    FOUND_COLOUR,
+    TRUE_COLOUR,
+    Objective,
+    PeopleObjective,
+    Validation,
+    in_rows,
+    mark,
+    tiled,
+)
 from facerf_cli.training.run import Run
-from facerf_cli.training.sheets import FOUND_COLOUR, TRUE_COLOUR, in_rows, mark, tiled
 
 _SHEET_ROWS, _SHEET_COLUMNS = 6, 4
 _RARE = ("brows", "eyes", "lips", "mouth", "beard", "ears", "glasses", "headwear", "hand")

@@ -24,9 +24,8 @@ from facerf_cli.synth.bank.portrait_samples import (
     StoredSquares,
 )
 from facerf_cli.synth.bank.proxies import add_proxies
-from facerf_cli.training.objective import Objective, PeopleObjective, Validation, seeded
+from facerf_cli.training.objective import Objective, PeopleObjective, Validation, seeded, tiled
 from facerf_cli.training.run import Run
-from facerf_cli.training.sheets import tiled
 
 _ROOT_OFFSET = 0.01  # keeps the slope of the root finite at black
 _SCALE = (0.4, 2.5)  # range of exposure between prediction and truth without a penalty

@@ -19,14 +19,8 @@ from facerf_cli.network.features import LightNetwork, feature_distance
 from facerf_cli.network.inputs import SourceColours, from_root, mean_colours, without_cast
 from facerf_cli.synth.bank.texture_samples import Sample, SampleSource
 from facerf_cli.training.losses import clipped_si_mse, root_loss
-from facerf_cli.training.objective import (
-    Objective,
-    PeopleObjective,
-    Validation,
-    seeded,
-)
+from facerf_cli.training.objective import Objective, PeopleObjective, Validation, seeded, tiled
 from facerf_cli.training.run import Run
-from facerf_cli.training.sheets import tiled
 
 _COLOUR_SEED, _COLOURS_MEASURED = 31415, 192
 _SHEET_FACES = 5
