@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.dataset.portraits import open_dataset_portraits
+from facerf_cli.dataset.squares import open_squares
 from facerf_cli.network.batch import Batch, concatenate
 from facerf_cli.network.portrait import PortraitMaps, PortraitNetwork
 from facerf_cli.portrait.parse import class_index
@@ -195,7 +195,7 @@ def build(run: Run) -> Objective:
     source: PortraitSource
     if options.dataset:
         backgrounds = run.backgrounds(options.output)
-        source = open_dataset_portraits(options.dataset, backgrounds, run.people, options.jobs)
+        source = open_squares(options.dataset, backgrounds, run.people, options.jobs)
     else:
         source = _stored_squares(run, held_out)
     settings = PortraitObjectiveSettings(held_out_people=held_out)

@@ -261,7 +261,7 @@ def test_the_portrait_network_trains_on_a_bank_of_people(
 @pytest.mark.slow
 def test_the_portrait_network_trains_on_a_dataset(tmp_path: Path, monkeypatch: Patch) -> None:
     # in other processes: tests/dataset/test_portraits.py
-    monkeypatch.setattr("facerf_cli.dataset.portraits.in_shards", lambda work, items, jobs: work(items))
+    monkeypatch.setattr("facerf_cli.dataset.squares.in_shards", lambda work, items, jobs: work(items))
     dataset = write_small_dataset(tmp_path / "dataset", (1, 1, 0), 1, lights=6, crop_px=192)
     line = ["train", "-o", str(tmp_path / "run"), "--stage", "portrait", "--preset", "tiny", "--workers", "0"]
     assert main([*line, "--dataset", str(dataset.folder), "--steps", "5"]) == 0

@@ -1,6 +1,6 @@
 """Samples that the Portrait Network is trained on: a photo in a random light, and under single lights.
 
-The people come from a bank (`people.py`) or a dataset (`dataset/portraits.py`).
+The people come from a bank (`people.py`) or a dataset (`dataset/squares.py`).
 """
 
 import math
@@ -78,7 +78,7 @@ class PortraitSample(Batch):
 
 
 class PortraitSource(Protocol):
-    """People to draw samples of: synthetic, or from a dataset (`dataset/portraits.py`)."""
+    """People to draw samples of: synthetic, or from a dataset (`dataset/squares.py`)."""
 
     @property
     def provenance(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Portraits of a prepared dataset; the stage `portrait` trains on them in place of synthetic people.
+"""Squares of the people of a prepared dataset, for the stage `portrait` in place of synthetic people.
 
     portraits-192/SUBJECT/CAMERA.safetensors   OLATs of a stack and their analysis; empty without a face
 
@@ -49,8 +49,8 @@ log = logging.getLogger(LOGGER_NAME)
 
 
 @dataclass(frozen=True, eq=False)
-class DatasetPortraits:
-    """Prepared dataset and its portraits, a `PortraitSource`; people are indices of `views`."""
+class DatasetSquares:
+    """Prepared dataset and its squares, a `PortraitSource`; people are indices of `views`."""
 
     dataset: Dataset
     views: list[list[Path]]  # of each person in the split train or validation, those that show a face
@@ -92,10 +92,8 @@ class DatasetPortraits:
         return sample_of(lit, seen, self.backgrounds, generator)
 
 
-def open_dataset_portraits(
-    folder: Path, backgrounds: Tensor, networks: Networks, jobs: int
-) -> DatasetPortraits:
-    """Open the dataset in a folder, and make missing portraits of its splits train and validation.
+def open_squares(folder: Path, backgrounds: Tensor, networks: Networks, jobs: int) -> DatasetSquares:
+    """Open the dataset in a folder, and make missing squares of its splits train and validation.
 
     Raises InputError if no face is found in a split.
     """
@@ -113,7 +111,7 @@ def open_dataset_portraits(
             )
     provenance = provenance_of(dataset, load_face_model(dataset.face_model))
     everyone = [*views["train"], *views["validation"]]
-    return DatasetPortraits(dataset, everyone, len(views["train"]), backgrounds, provenance)
+    return DatasetSquares(dataset, everyone, len(views["train"]), backgrounds, provenance)
 
 
 def _shows_a_face(path: Path) -> bool:

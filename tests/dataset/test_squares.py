@@ -7,7 +7,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from facerf_cli.dataset.portraits import DatasetPortraits, open_dataset_portraits
+from facerf_cli.dataset.squares import DatasetSquares, open_squares
 from facerf_cli.errors import InputError
 from facerf_cli.network.portrait import SKIN
 from facerf_cli.portrait.person import SIDE_PX
@@ -25,19 +25,19 @@ def backgrounds() -> Tensor:
 
 
 @pytest.fixture(scope="module")
-def portraits(tmp_path_factory: Folders) -> DatasetPortraits:
+def portraits(tmp_path_factory: Folders) -> DatasetSquares:
     folder = tmp_path_factory.mktemp("dataset")
     write_small_dataset(folder, (2, 1, 0), 1, lights=14, crop_px=192, lacking={"0001": range(LACKS)})
     with pytest.MonkeyPatch.context() as patch:  # another test has processes
-        patch.setattr("facerf_cli.dataset.portraits.in_shards", lambda work, items, jobs: work(items))
-        return open_dataset_portraits(folder, backgrounds(), SHIPPED_NETWORKS, 1)
+        patch.setattr("facerf_cli.dataset.squares.in_shards", lambda work, items, jobs: work(items))
+        return open_squares(folder, backgrounds(), SHIPPED_NETWORKS, 1)
 
 
-def drawn(portraits: DatasetPortraits, person: int, seed: int = 1) -> PortraitSample:
+def drawn(portraits: DatasetSquares, person: int, seed: int = 1) -> PortraitSample:
     return portraits.draw([person], 2, torch.Generator().manual_seed(seed))
 
 
-def test_people_are_those_of_the_splits_with_the_lights_of_their_stacks(portraits: DatasetPortraits) -> None:
+def test_people_are_those_of_the_splits_with_the_lights_of_their_stacks(portraits: DatasetSquares) -> None:
     assert portraits.people(5) == ([0, 1], [2]) and portraits.people(0)[1] == []
     # A matt face without shadows: each target is its light's cosine, but for the exposure.
     sample = drawn(portraits, 0)
@@ -55,7 +55,7 @@ def test_people_are_those_of_the_splits_with_the_lights_of_their_stacks(portrait
     assert (fewer.weights[0, -LACKS:] == 0).all() and (whole.weights[0, -LACKS:] > 0).any()
 
 
-def test_what_is_seen_lies_on_the_images(portraits: DatasetPortraits) -> None:
+def test_what_is_seen_lies_on_the_images(portraits: DatasetSquares) -> None:
     """Moved by 3 pixels the skin covers less of the lit face."""
     seen = load_file(portraits.views[0][0])
     face = (seen["lit"].float().mean(0) > 0.02).float()
@@ -65,20 +65,20 @@ def test_what_is_seen_lies_on_the_images(portraits: DatasetPortraits) -> None:
     assert moves[errors.index(min(errors))] == (0, 0)
 
 
-def test_finished_portraits_are_kept(portraits: DatasetPortraits) -> None:
+def test_finished_portraits_are_kept(portraits: DatasetSquares) -> None:
     path = portraits.views[0][0]
     before = path.stat().st_mtime_ns
-    open_dataset_portraits(portraits.dataset.folder, backgrounds(), SHIPPED_NETWORKS, 1)
+    open_squares(portraits.dataset.folder, backgrounds(), SHIPPED_NETWORKS, 1)
     assert path.stat().st_mtime_ns == before
 
 
 def test_a_split_without_a_face_or_anybody_is_refused(tmp_path: Path, monkeypatch: Patch) -> None:
-    monkeypatch.setattr("facerf_cli.dataset.portraits._make_missing", lambda *_: None)
-    monkeypatch.setattr("facerf_cli.dataset.portraits._shows_a_face", lambda _: False)
+    monkeypatch.setattr("facerf_cli.dataset.squares._make_missing", lambda *_: None)
+    monkeypatch.setattr("facerf_cli.dataset.squares._shows_a_face", lambda _: False)
     for count, expected in (
         (2, "no subject in the split validation"),
         (1, "no face was found in the split train"),
     ):
         folder = tmp_path / str(count)
         write_small_dataset(folder, (count, 0, 0), 1, lights=4, crop_px=192)
-        refused(InputError, expected, open_dataset_portraits, folder, backgrounds(), SHIPPED_NETWORKS, 1)
+        refused(InputError, expected, open_squares, folder, backgrounds(), SHIPPED_NETWORKS, 1)
