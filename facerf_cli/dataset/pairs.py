@@ -22,7 +22,6 @@ from torch import Tensor
 
 from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.weights import (
-    DEFAULT_MEMORY_BYTES,
     EnvmapTask,
     Spread,
     compute_weights,
@@ -275,19 +274,13 @@ def compute_pair_weights(
     return weights, exposed
 
 
-def relight_subject(
-    dataset: Dataset,
-    pairs: list[Pair],
-    weights: np.ndarray,
-    memory_bytes: int = DEFAULT_MEMORY_BYTES,
-    overwrite: bool = False,
-) -> int:
+def relight_subject(dataset: Dataset, pairs: list[Pair], weights: np.ndarray, overwrite: bool = False) -> int:
     """Write the missing sources of a subject's pairs, with weights [rows, L, 3]; return their number."""
     todo = [row for row, pair in enumerate(pairs) if overwrite or not image_path(dataset, *pair.key).exists()]
     for camera in sorted({pairs[row].source_camera for row in todo}):
         rows = [row for row in todo if pairs[row].source_camera == camera]
         path = dataset.stack_path(pairs[rows[0]].subject, camera)
-        images = relit_images(path, torch.from_numpy(np.array(weights[rows])), memory_bytes)
+        images = relit_images(path, torch.from_numpy(np.array(weights[rows])))
         attributes = attributes_of_sum(read_olat_header(path).metadata)
         for row, image in zip(rows, images, strict=True):
             recipe = {f"facerf:{name}": value for name, value in asdict(pairs[row]).items()}

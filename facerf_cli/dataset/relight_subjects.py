@@ -23,7 +23,6 @@ from facerf_cli.dataset.pairs import (
 from facerf_cli.dataset.settings import PairSettings
 from facerf_cli.dataset.weights import envmap_names
 from facerf_cli.errors import UsageError
-from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.run.workers import process_died, spread
 from facerf_cli.synth.sky.skies import parse_envmaps
@@ -115,7 +114,7 @@ class _Relight(Job):
     def __call__(self, item: Item) -> Outcome:
         """Write the missing sources."""
         pairs, weights = load_pairs(self.dataset)[item.name]
-        made = relight_subject(self.dataset, pairs, weights, memory.limit_bytes(), self.overwrite)
+        made = relight_subject(self.dataset, pairs, weights, self.overwrite)
         return Outcome(self.outputs_of(item), {"pictures": len(pairs), "made": made})
 
 

@@ -10,7 +10,7 @@ world axis nearest to their up becomes the envmap's y, the one nearest to their 
 **Tiles.** For each channel, weights [M, L] are multiplied with a stack [L, P] in tiles of constant shape:
 `TILE_IMAGES` images (the last tile is padded with zeros) by a number of complete rows that depends only on
 the image's size and the number of lights. Therefore an image's bits do not depend on the number of images
-made together or on the memory limit.
+made together.
 """
 
 import math
@@ -30,6 +30,7 @@ from facerf_cli.files.light_files import read_map_file
 from facerf_cli.files.olat_stack import read_olat_header, read_olats
 from facerf_cli.files.write import HALF_MAX
 from facerf_cli.light.envmap import rotated_weights, texel_integrals
+from facerf_cli.run import memory
 from facerf_cli.run.workers import one_thread
 from facerf_cli.synth.sky.skies import ProceduralMaps, draw_sky
 
@@ -142,56 +143,36 @@ def _world_to_head(dataset: Dataset, subject: str, camera: str) -> np.ndarray:
 
 
 TILE_IMAGES = 128
-DEFAULT_MEMORY_BYTES = 2 << 30
 # Limits of a tile: pixels, and lights times pixels, with three float32 copies of each.
 _TILE_PX = 1 << 13
 _TILE_VALUES = 1 << 22
 
 
-def relit_images(path: Path, weights: Tensor, memory_bytes: int = DEFAULT_MEMORY_BYTES) -> Iterator[Tensor]:
+def relit_images(path: Path, weights: Tensor) -> Iterator[Tensor]:
     """Yield the images [3, H, W] float16 of a stack under weights [M, L, 3], in order, on one thread.
 
-    The stack, or a strip of its rows, takes half of the memory, the current batch of images a quarter. A
-    stack that fits is read once, a larger one once per batch.
+    The stack must fit into memory. The images that are summed at once take at most half of it.
     """
-    header = read_olat_header(path)
-    (height, width), lights = header.seen.shape, len(header.directions)
+    olats = read_olats(path)
+    lights, _, height, width = olats.shape
     if weights.shape[1] != lights:
         raise InputError(f"{path}: {lights} lights, the dataset has {weights.shape[1]}; {PREPARE_AGAIN}")
-    rows = memory_bytes // 2 // (6 * lights * width)
-    if rows < height:  # complete tiles and compressed blocks
-        rows = max(_power_of_two(rows), _tile_rows(lights, width))
-    whole = read_olats(path) if rows >= height else None
-    batch = max(1, memory_bytes // (4 * 6 * height * width))
-    batch = batch if batch < TILE_IMAGES else batch // TILE_IMAGES * TILE_IMAGES
-    for part in torch.split(weights, batch):
+    at_once = max(1, min(TILE_IMAGES, memory.left_bytes() // (2 * 6 * height * width)))
+    for part in torch.split(weights, at_once):
         images = torch.empty(len(part), 3, height, width, dtype=torch.float16)
-        for first in range(0, height, rows):
-            strip = slice(first, min(first + rows, height))
-            multiply(read_olats(path, rows=strip) if whole is None else whole, part, images[:, :, strip])
+        multiply(olats, part, images)
         yield from images
 
 
 def multiply(olats: Tensor, weights: Tensor, images: Tensor) -> None:
-    """Fill images [M, 3, h, W] float16 with OLATs [L, 3, h, W] float16 under weights [M, L, 3]."""
+    """Fill images [M, 3, H, W] float16, M <= TILE_IMAGES, with OLATs [L, 3, H, W] float16 under weights."""
     lights, _, height, width = olats.shape
-    rows = _tile_rows(lights, width)
-    blocks = torch.split(weights.permute(2, 0, 1), TILE_IMAGES, dim=1)  # [3, m, L]
-    padded = [torch.nn.functional.pad(block, (0, 0, 0, TILE_IMAGES - block.shape[1])) for block in blocks]
+    rows = 1 << max(0, (min(_TILE_PX, _TILE_VALUES // lights) // width).bit_length() - 1)  # a power of two
+    missing = TILE_IMAGES - len(weights)
+    padded = torch.nn.functional.pad(weights.permute(2, 0, 1), (0, 0, 0, missing))  # [3, TILE_IMAGES, L]
     with one_thread():
         for first in range(0, height, rows):
             part = olats[:, :, first : first + rows]
             tile = part.permute(1, 0, 2, 3).reshape(3, lights, -1).float()
-            for block, out in zip(padded, torch.split(images, TILE_IMAGES), strict=True):
-                lit = torch.bmm(block, tile).clamp_(-HALF_MAX, HALF_MAX).transpose(0, 1)[: len(out)]
-                out[:, :, first : first + rows] = lit.reshape(len(out), 3, -1, width)
-
-
-def _tile_rows(lights: int, width: int) -> int:
-    """Return the rows of a tile, a power of two."""
-    return _power_of_two(min(_TILE_PX, _TILE_VALUES // lights) // width)
-
-
-def _power_of_two(number: int) -> int:
-    """Return the largest power of two up to a number, at least 1."""
-    return 1 << max(0, number.bit_length() - 1)
+            lit = torch.bmm(padded, tile).clamp_(-HALF_MAX, HALF_MAX).transpose(0, 1)[: len(images)]
+            images[:, :, first : first + rows] = lit.reshape(len(images), 3, -1, width)

@@ -1,12 +1,11 @@
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
+from facerf_cli.dataset import weights as module
 from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.pairs import (
     draw_pair,
@@ -22,6 +21,7 @@ from facerf_cli.dataset.pairs import (
 )
 from facerf_cli.dataset.prepare import constant_weights
 from facerf_cli.dataset.weights import (
+    TILE_IMAGES,
     EnvmapTask,
     EnvmapWeights,
     compute_weights,
@@ -33,7 +33,7 @@ from facerf_cli.dataset.weights import (
     world_to_map,
 )
 from facerf_cli.errors import FacerfError, InputError, UsageError
-from facerf_cli.files.olat_stack import read_olat_header, read_olats, write_olat_stack
+from facerf_cli.files.olat_stack import read_olat_header, read_olats
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_exr
 from facerf_cli.synth.sky.skies import ProceduralMaps
@@ -155,47 +155,32 @@ def test_the_vertical_is_found_whatever_the_capture_calls_it(
     torch.testing.assert_close(map_directions(tilted), map_directions(dataset))
 
 
-def test_the_product_is_the_sum_whatever_the_parts(tmp_path: Path) -> None:
-    """Odd sizes and more pictures than a tile: the plain sum within a half, the same bits in any company."""
+def test_the_product_is_the_sum_whatever_the_parts() -> None:
+    """Odd sizes: the plain sum within a half, the same bits in any company."""
     olats = torch.rand(7, 37, 150, 3).half().permute(0, 3, 1, 2)  # as a stack that was read
-    weights = torch.rand(131, 7, 3)
-    images = torch.empty(131, 3, 37, 150, dtype=torch.float16)
+    weights = torch.rand(TILE_IMAGES, 7, 3)
+    images = torch.empty(TILE_IMAGES, 3, 37, 150, dtype=torch.float16)
     multiply(olats, weights, images)
     truth = torch.einsum("mlc,lchw->mchw", weights.double(), olats.double())
     torch.testing.assert_close(images.double(), truth, rtol=1e-3, atol=1e-4)
-    order = torch.randperm(131)
+    order = torch.randperm(TILE_IMAGES)
     few = torch.empty(5, 3, 37, 150, dtype=torch.float16)
     multiply(olats, weights[order[:5]], few)
     assert torch.equal(few, images[order[:5]])  # a picture's bits do not depend on its neighbours
 
 
-def test_memory_bounds_what_is_held_and_changes_no_bit(
-    dataset: Dataset, tmp_path: Path, monkeypatch: Patch
+def test_images_that_fit_the_memory_are_summed_at_once_and_have_the_same_bits(
+    dataset: Dataset, monkeypatch: Patch
 ) -> None:
-    source = dataset.stack_path("0000", "C0")
-    header = read_olat_header(source)
-    tall = {name: np.tile(getattr(header, name), (5, 5, 1)) for name in ("source", "normals")}
-    header = replace(header, **tall, seen=np.tile(header.seen, (5, 5)))
-    path = tmp_path / "large.exr"
-    write_olat_stack(path, header, [torch.tile(read_olat_stack(source).olats, (5, 5))])
-    weights = torch.rand(3, 20, 3)
-    whole = torch.stack(list(relit_images(path, weights)))
-    held: list[int] = []
-
-    def spy(*arguments: object, **named: object) -> Tensor:
-        part = read_olats(*arguments, **named)  # type: ignore[arg-type]
-        held.append(2 * part.numel())
-        return part
-
-    monkeypatch.setattr("facerf_cli.dataset.weights.read_olats", spy)
-    memory_bytes = 3 << 20  # of a stack of 7 MB
-    parts = torch.stack(list(relit_images(path, weights, memory_bytes)))
-    assert torch.equal(parts, whole)
-    assert len(held) > 3 and max(held) <= memory_bytes / 2
-    torch.testing.assert_close(
-        whole.double(), torch.einsum("mlc,lchw->mchw", weights, read_olat_stack(path).olats.float()).double(),
-        rtol=1e-3, atol=1e-3,
-    )  # fmt: skip
+    path, weights = dataset.stack_path("0000", "C0"), torch.rand(3, 20, 3)
+    together = torch.stack(list(relit_images(path, weights)))
+    parts: list[int] = []
+    monkeypatch.setattr(module, "multiply", lambda *given: parts.append(len(given[1])) or multiply(*given))
+    monkeypatch.setattr("facerf_cli.run.memory.left_bytes", lambda: 2 * 2 * 6 * 48 * 48)
+    assert torch.equal(torch.stack(list(relit_images(path, weights))), together) and parts == [2, 1]
+    olats = read_olat_stack(path).olats.double()
+    truth = torch.einsum("mlc,lchw->mchw", weights.double(), olats)
+    torch.testing.assert_close(together.double(), truth, rtol=1e-3, atol=1e-3)
 
 
 def test_parts_of_a_stack_and_a_stack_of_another_rig(dataset: Dataset) -> None:
