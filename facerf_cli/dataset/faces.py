@@ -115,7 +115,9 @@ class DatasetFaces:
     fewest_lights: int  # that a subject has
     rig_lights: int  # of the mean face's shadows
     provenance: dict[str, Any]
-    weights: dict[int, Tensor] = field(default_factory=dict)  # `crop_weights` of stacks, by their numbers
+    point_weights: dict[int, Tensor] = field(
+        default_factory=dict
+    )  # `crop_weights` of stacks, by their numbers
 
     def people(self, held_out: int) -> tuple[Tensor, Tensor]:
         """Return people of the split train, and at most `held_out` of the split validation."""
@@ -238,14 +240,14 @@ class DatasetFaces:
     def _weights_of(self, crops: FaceCrops) -> Tensor:
         """Return `crop_weights` of crops; computed once for the stacks that fit into `_WEIGHTS_BYTES`."""
         numbers = crops.stacks.tolist()
-        missing = [place for place, number in enumerate(numbers) if number not in self.weights]
+        missing = [place for place, number in enumerate(numbers) if number not in self.point_weights]
         weights = {}
         if missing:
             made = crop_weights(crops.vertices[missing], self.crop_px, self.side)
             weights = dict(zip((numbers[place] for place in missing), made, strict=True))
-            if len(self.weights) * made[0].nbytes < _WEIGHTS_BYTES:
-                self.weights.update(weights)
-        return torch.stack([weights[n] if n in weights else self.weights[n] for n in numbers])
+            if len(self.point_weights) * made[0].nbytes < _WEIGHTS_BYTES:
+                self.point_weights.update(weights)
+        return torch.stack([weights[n] if n in weights else self.point_weights[n] for n in numbers])
 
 
 def _read_face(path: Path, info: StackInfo, lights: Sequence[int]) -> Tensor:

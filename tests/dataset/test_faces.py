@@ -166,7 +166,7 @@ def test_textures_do_not_depend_on_what_was_unwrapped_before(faces: DatasetFaces
     fresh = open_faces(faces.dataset.folder, "builtin", SIDE, LIGHTS)
     parts = [draw(fresh, head).target for head in range(3)]
     expected = [fresh.unwrapped(part)[0] for part in parts]
-    fresh.weights.pop(next(iter(fresh.weights)))
+    fresh.point_weights.pop(next(iter(fresh.point_weights)))
     mixed, _ = fresh.unwrapped(concatenate([*parts, *parts]))  # one stack is unknown again, and twice there
     torch.testing.assert_close(mixed, torch.cat([*expected, *expected]))
 

