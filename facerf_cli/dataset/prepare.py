@@ -2,12 +2,12 @@
 
 Images are read one at a time, twice: for the fully lit sum that the face is detected in, and for the stack.
 At most one camera's sum is in memory. A `Selection` lists the lights and cameras to use; a camera that does
-not see the face is also left out. `index_page` shows each subject's sheet, split, fit and findings.
+not see the face is also left out.
 """
 
 import logging
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,8 @@ from torch import Tensor
 
 from facerf_cli.batch.recipe import Recipe
 from facerf_cli.capture.capture import Capture
-from facerf_cli.capture.findings import Finding, Selection
-from facerf_cli.dataset.dataset import CameraRecord, Dataset, DatasetFolder, SubjectRecord
+from facerf_cli.capture.findings import Selection
+from facerf_cli.dataset.dataset import CameraRecord, DatasetFolder, SubjectRecord
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import (
@@ -37,7 +37,7 @@ from facerf_cli.face.view import draw_fit
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import read_document, write_document
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
-from facerf_cli.files.sheets import contact_sheet, filled_page, mark_light
+from facerf_cli.files.sheets import contact_sheet, mark_light
 from facerf_cli.files.write import HALF_MAX, write_display
 from facerf_cli.image.colour import auto_exposure_ev, to_display
 from facerf_cli.light.envmap import envmap_weights
@@ -282,16 +282,6 @@ def _crops(
     elif lit < _DIMMEST:
         advice = "the lights' intensities in stage.json are too large"
         log.warning("%s: a constant map of radiance 1 gives radiance %.2g at most; %s", name, lit, advice)
-
-
-def index_page(
-    dataset: Dataset, records: Mapping[str, SubjectRecord], findings: Mapping[str, Sequence[Finding]]
-) -> str:
-    """Return the HTML page of a dataset: the records of finished subjects and the findings."""
-    template = Path(__file__).with_name("index.html")
-    return filled_page(
-        template, dataset=dataset, records=records, findings=findings, split_of=dataset.split_of
-    )
 
 
 def sheet_lights(directions: np.ndarray) -> list[int]:

@@ -43,7 +43,6 @@ from facerf_cli.dataset.dataset import (
 from facerf_cli.dataset.pairs import GIVE_BEFORE, PAIRS_NAME, RELIT
 from facerf_cli.dataset.prepare import (
     Preparation,
-    index_page,
     prepare_subject,
     prepared_subjects,
     subject_outputs,
@@ -54,6 +53,7 @@ from facerf_cli.face.fit import CROP_STEP_PX
 from facerf_cli.face.morphable import BUILTIN, BUILTIN_PATH, load_face_model
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import write_document
+from facerf_cli.files.sheets import filled_page
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.network.files import serving_files
 from facerf_cli.relighting.models import Networks
@@ -244,7 +244,8 @@ def _write_dataset(
         return
     dataset = describe_dataset(folder, capture, records, split, seed, how.model, face_model_sha256)
     with atomic_path(folder / "index.html") as temporary:
-        text = index_page(dataset, records, findings)
+        page = {"dataset": dataset, "records": records, "findings": findings, "split_of": dataset.split_of}
+        text = filled_page(Path(__file__).with_name("index.html"), **page)
         temporary.write_text(text, encoding="utf-8", errors="replace")  # folder names may be any bytes
     write_document(folder / DATASET_FILE, dataset.content())
     print(folder / DATASET_FILE)

@@ -1,7 +1,7 @@
 """Preparation of textures and images for networks: exposure, colour cast, roots, resizing and head pose."""
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -34,13 +34,9 @@ class SourceColours:
         red, blue = chroma.mean(0).tolist()
         return SourceColours((red, blue), ((a, b), (b, c)))
 
-    def as_metadata(self) -> dict[str, Any]:
-        """Return numbers for a checkpoint."""
-        return asdict(self)
-
     @staticmethod
     def from_metadata(metadata: Any) -> "SourceColours":
-        """Read `as_metadata`; raises KeyError, TypeError or ValueError for anything else."""
+        """Read numbers of a checkpoint; raises KeyError, TypeError or ValueError if they are invalid."""
         red, blue = (float(value) for value in metadata["mean"])
         (a, b), (c, d) = ((float(x), float(y)) for x, y in metadata["covariance"])
         if not (a > 0 and d > 0 and b == c and a * d > b * b and all(map(math.isfinite, (red, blue, a, d)))):

@@ -247,7 +247,7 @@ class Trainer:
         return {
             **{name: start[name] for name in INPUTS if name in start},
             **self.objective.inputs,
-            **({"source_colours": colours.as_metadata()} if colours else {}),
+            **({"source_colours": asdict(colours)} if colours else {}),
             "layout_version": LAYOUT_VERSION,
             "licence": "; ".join(dict.fromkeys(words for words in licences if words)),
             "provenance": provenance,
