@@ -61,7 +61,7 @@ def test_what_is_no_face_model_is_refused_in_one_line(case: str, model, tmp_path
     arrays = arrays_of(model, tmp_path)
     CHANGES[case](arrays)
     np.savez_compressed(tmp_path / "bad.npz", **arrays)
-    refused(InputError, "bad.npz ... not a facerf face model", load_face_model, tmp_path / "bad.npz")
+    refused(InputError, "bad.npz ... not a facerf face model ... face-model import", load_face_model, tmp_path / "bad.npz")
 
 
 def test_an_array_that_claims_more_than_memory_holds_is_refused(model, tmp_path):

@@ -4,7 +4,6 @@ import torch
 
 from facerf_cli.baselines.synthesis import ASSET, SIDE, light_prior, skin_prior
 from facerf_cli.face.topology import region_mask
-from tools import baseline_priors
 from tools.baseline_priors import LIGHT_ORDER, learn_light, learn_skin
 
 
@@ -27,15 +26,3 @@ def test_priors_drawn_again_are_faces_with_more_light_from_above() -> None:
     constant, upward = light_prior(1).mean[:2, 1]
     assert 0.2 < float(upward / constant) < 1.5
     assert ASSET.stat().st_size < 2 << 20
-
-
-def test_components_have_their_variance_and_lower_orders_are_parts_of_higher_ones() -> None:
-    samples = torch.randn(4000, 6) * torch.tensor([3.0, 2, 1, 0.5, 0.1, 0.01]) + 5
-    found = baseline_priors._principal(samples, 6)
-    assert torch.allclose(found.modes.T @ found.modes, samples.T.cov(), atol=1e-3)
-    few = baseline_priors._principal(samples[:4], 3)  # fewer samples than dimensions
-    assert torch.allclose(few.modes.T @ few.modes, samples[:4].T.cov(), atol=1e-3)
-    whole, part = light_prior(LIGHT_ORDER), light_prior(2)
-    assert torch.equal(part.mean, whole.mean[:9])
-    covariance = torch.einsum("rkc,rld->kcld", whole.modes, whole.modes)[:9, :, :9]
-    assert torch.allclose(torch.einsum("rkc,rld->kcld", part.modes, part.modes), covariance, atol=1e-2)
