@@ -18,7 +18,6 @@ from facerf_cli.light.envmap import (
     rig_to_latlong,
     rig_triangles,
     rotated_weights,
-    texel_integrals,
     turned,
     without_keys,
 )
@@ -104,18 +103,6 @@ def test_a_light_and_a_one_texel_map_agree(azimuth_deg: float, elevation_deg: fl
     normals = torch.stack([x, y, (50.5**2 - x * x - y * y).clamp(min=0).sqrt()], -1) / 50.5
     inner = normals[..., 2] > 0.3
     torch.testing.assert_close(diffuse[inner][:, 1], (normals @ light).clamp(min=0)[inner], rtol=0, atol=0.04)
-
-
-def test_rotation_by_whole_and_half_pixels() -> None:
-    envmap = torch.rand(16, 32, 3)
-    for pixels in (-3, 37):
-        moved = envmap.roll(-pixels, dims=1)  # azimuth grows to the left of the map
-        turned = envmap_weights(envmap, RIG, rotate_deg=pixels * 360 / 32)
-        torch.testing.assert_close(turned, envmap_weights(moved, RIG), rtol=1e-5, atol=1e-7)
-    envmap = torch.rand(8, 16, 3)
-    half = texel_integrals(envmap, 8, 16, rotate_deg=360 / 32)
-    both = (texel_integrals(envmap, 8, 16) + texel_integrals(envmap, 8, 16, rotate_deg=360 / 16)) / 2
-    torch.testing.assert_close(half, both, rtol=1e-12, atol=1e-12)
 
 
 def test_turned_maps_are_themselves_turned_one_by_one_or_together() -> None:
@@ -340,23 +327,6 @@ def test_gradients_reach_the_map() -> None:
     assert envmap.grad is not None
     solid = latlong_solid_angles(ROWS, 2 * ROWS)[..., None].expand(-1, -1, 3)
     torch.testing.assert_close(envmap.grad, solid / math.pi, rtol=1e-4, atol=1e-7)
-
-
-def test_blender_reads_a_map_that_is_shifted_by_a_quarter() -> None:
-    """As docs/integrations.md says, for a head in Blender's front view."""
-    direction = azel_to_direction(54, 36).double()  # to the image's right, above, in front
-    u, v = direction_to_uv(direction).tolist()
-    envmap = torch.zeros(180, 360, 3)
-    envmap[int(v * 180), int(u * 360)] = 1
-    row, column = divmod(int(np.roll(envmap, 90, 1)[..., 0].argmax()), 360)
-    x, y, z = direction[0], -direction[2], direction[1]  # Blender's: the head looks along -Y, Z up
-    blender_u = 0.5 - math.atan2(y, x) / (2 * math.pi)
-    blender_v = 1 - math.acos(z) / math.pi  # 1 at the top
-    assert column + 0.5 == pytest.approx(blender_u * 360, abs=1)
-    assert row + 0.5 == pytest.approx((1 - blender_v) * 180, abs=1)
-    # In Blender 4.5 (bpy, Cycles) a spot at u = 0.6, 0.3 from the top lit a ball from (0.658, 0.595, 0.463).
-    assert (blender_u, 1 - blender_v) == pytest.approx((0.6, 0.3), abs=1e-3)
-    assert direction.tolist() == pytest.approx((0.658, 0.595, 0.463), abs=0.02)
 
 
 def back_and_forth(weights: Tensor, height: int) -> tuple[Tensor, float]:

@@ -151,16 +151,3 @@ def test_interpolated_positions_project_back_to_their_pixels() -> None:
     px = project(interpolate(vertices, triangles, fragments), WIDE)
     y, x = torch.meshgrid(torch.arange(22) + 0.5, torch.arange(37) + 0.5, indexing="ij")
     torch.testing.assert_close(px, torch.stack([x, y], -1).double(), rtol=0, atol=1e-9)
-
-
-def test_gradients_to_vertices_and_attributes() -> None:
-    vertices, triangles = triangle_soup(5, seed=11)
-    attributes = torch.randn(len(vertices), 2, dtype=torch.float64)
-
-    def image(v: Tensor, a: Tensor) -> Tensor:
-        fragments = rasterize(v, triangles, WIDE)
-        return interpolate(a, triangles, fragments)
-
-    assert torch.autograd.gradcheck(
-        image, (vertices.requires_grad_(), attributes.requires_grad_()), eps=1e-7, atol=1e-5, fast_mode=True
-    )

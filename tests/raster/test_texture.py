@@ -182,17 +182,6 @@ def test_inpaint_at_the_extremes() -> None:
     torch.testing.assert_close(inpaint(texture, torch.ones(32, 32)), texture)
 
 
-def test_render_has_gradients_to_texture_and_vertices() -> None:
-    camera = Camera(90.0, 26, 20, 13.2, 9.6)
-    texture, vertices = smooth_texture(32).double().requires_grad_(), head(TILTED).double().requires_grad_()
-
-    def image(t: Tensor, shift: Tensor) -> Tensor:
-        return render_texture(t, vertices + shift, TRIANGLES, UV.double(), camera)[0]
-
-    shift = torch.zeros(3, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(image, (texture, shift), eps=1e-9, atol=1e-3, fast_mode=True)
-
-
 def test_unwrap_has_gradients_to_image_and_vertices() -> None:
     vertices = head(TILTED).requires_grad_()
     image = smooth_texture(300)[:, :220].clone().requires_grad_()
