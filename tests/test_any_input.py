@@ -48,7 +48,6 @@ from facerf_cli.work.photo_options import parse_pose
 # The same examples each time, in a second or two.
 DRAWN = settings(derandomize=True, max_examples=100, deadline=None, database=None)
 FINITE = st.floats(width=32, allow_nan=False, allow_infinity=False, min_value=-(2.0**90), max_value=2.0**90)
-FIELDS = st.sampled_from(["dir", "stem", "ext", "frame"])
 TEXT = st.text(st.characters(codec=None), max_size=60)  # surrogates too, as names of files have them
 
 

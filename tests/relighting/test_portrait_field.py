@@ -23,8 +23,6 @@ from facerf_cli.person import Person, Target, fit
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.parse import class_index
 from facerf_cli.portrait.person import SEEN_PX, wider_square
-from facerf_cli.relighting import portrait_field
-from facerf_cli.relighting.detail import finer_detail
 from facerf_cli.relighting.fitting import reflectance_of
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
@@ -197,24 +195,6 @@ def test_left_and_right_are_treated_alike_and_without_light_all_is_black(field: 
     torch.testing.assert_close(turned, field.field.relit(light.directions, light.weights[None], turn))
     as_seen = field.relit(light.directions, light.weights[None])
     assert (as_seen - turned).abs().mean() > 1e-3
-
-
-def test_the_detail_of_a_texture_is_computed_once_but_for_gradients(
-    field: PortraitField, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    computed: list[int] = []
-    monkeypatch.setattr(
-        portrait_field, "finer_detail", lambda *inputs: computed.append(1) or finer_detail(*inputs)
-    )
-    light, fresh = lamp(20), replace(field)
-    first, second = (fresh.relit(light.directions, light.weights[None]) for _ in range(2))
-    assert len(computed) == 1 and torch.equal(first, second)
-    texture = field.field.face.texture.clone().requires_grad_()
-    face_field = replace(field.field, face=replace(field.field.face, texture=texture))
-    fresh = replace(field, field=face_field)
-    for _ in range(2):
-        fresh.relit(light.directions, light.weights[None]).sum().backward()
-    assert texture.grad is not None and texture.grad.abs().sum() > 0
 
 
 def test_a_lamp_lights_its_side_and_one_behind_leaves_the_face_dark(
