@@ -2,7 +2,6 @@
 
 import json
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -224,25 +223,11 @@ def test_h5py_is_an_extra(tmp_path: Path, monkeypatch: Patch) -> None:
     refused(FacerfError, "pip install 'facerf[face-models]'", read_basel, tmp_path / "model.h5")
 
 
-WRONG_MAT: dict[str, tuple[Callable[[dict[str, Any]], dict[str, Any]], str]] = {
-    "no basis": (lambda m: {key: value for key, value in m.items() if key != "shapePC"}, "shapePC"),
-    "a basis of another mesh": (
-        lambda m: {**m, "shapePC": np.zeros((9, 199))},
-        "pcaBasis is float64 of shape [9, 199]",
-    ),
-    "a structure": (lambda m: {**m, "shapeEV": {"a": 1}}, "not a Basel"),
-    "triangles beyond": (lambda m: {**m, "tl": m["tl"] + 1}, "does not have"),
-    "not finite": (lambda m: {**m, "shapeMU": m["shapeMU"] * np.nan}, "non-finite"),
-    "millimetres": (lambda m: {**m, "shapeMU": m["shapeMU"] / 1000}, "published unit"),
-}
-
-
 @pytest.mark.usefixtures("here")
-@pytest.mark.parametrize("case", WRONG_MAT)
-def test_what_is_not_basel_2009_is_refused_in_one_line(face: Head, tmp_path: Path, case: str) -> None:
-    change, message = WRONG_MAT[case]
-    path = written_mat(tmp_path / "a.mat", change(mat(face)))
-    refused(InputError, f"{path} ... {message}", import_face_model, path)
+def test_what_is_not_basel_2009_is_refused_in_one_line(face: Head, tmp_path: Path) -> None:
+    for change in ({"shapePC": np.zeros((9, 199))}, {"shapeEV": {"a": 1}}):
+        path = written_mat(tmp_path / "a.mat", mat(face) | change)
+        refused(InputError, f"{path} ... not a Basel Face Model 2009", import_face_model, path)
 
 
 def test_a_matrix_of_matlab_7_3_and_other_files_are_refused(tmp_path: Path) -> None:
@@ -257,23 +242,11 @@ def test_a_matrix_of_matlab_7_3_and_other_files_are_refused(tmp_path: Path) -> N
 
 
 WRONG_H5: dict[str, tuple[dict[str, Any], str]] = {
-    "no expressions": (
-        {f"expression/model/{name}": None for name in ("mean", "pcaBasis", "pcaVariance")},
-        "it lacks expression/model",
-    ),
-    "text for numbers": ({"shape/model/mean": "text"}, "not a Basel"),
-    "a basis of another mesh": (
-        {"shape/model/pcaBasis": np.zeros((9, 199))},
-        "pcaBasis is float64 of shape",
-    ),
+    "no expressions": ({"expression/model/mean": None}, "it lacks expression/model"),
     "scaled already": ({"shape/model/pcaBasis": 7 * np.ones((10800, 199), "f4")}, "unit length"),
     "variance below zero": ({"shape/model/pcaVariance": -np.ones(199)}, "pcaVariance is negative"),
-    "triangles beyond": ({"shape/representer/cells": np.full((3, 9), 99999)}, "does not have"),
-    "not finite": ({"shape/model/mean": np.full(10800, np.nan)}, "non-finite"),
     "a link to another file": ({"shape/model/mean": h5py.ExternalLink("b.h5", "/a")}, "2017"),
-    "a link in circles": ({"shape/model/mean": h5py.SoftLink("/shape/model/mean")}, "2017"),
     "names of another kind": ({"metadata/landmarks/json": "[1, 2]"}, "not a Basel Face Model 2017"),
-    "metres": ({"shape/model/mean": np.zeros(10800)}, "published unit"),
 }
 
 
