@@ -87,9 +87,8 @@ def test_float32_differs_from_the_oracle_only_by_rounding() -> None:
     torch.testing.assert_close(fragments.barycentric, weights.float(), rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_a_mesh_is_watertight(seed: int) -> None:
-    vertices, triangles = bumpy_grid(30, seed)
+def test_a_mesh_is_watertight() -> None:
+    vertices, triangles = bumpy_grid(30, seed=0)
     alone = torch.zeros(WIDE.height_px, WIDE.width_px, dtype=torch.int64)
     for corners in triangles:
         alone += rasterize(vertices, corners[None], WIDE).covered

@@ -180,9 +180,12 @@ def test_a_field_that_is_corrected_sees_no_coloured_shade(models: Models, head: 
     assert seen[1] < 0.6 * seen[0]
 
 
-def test_features_see_the_exposure_of_their_training(models: Models, head: Head) -> None:
+def test_features_see_the_exposure_of_their_training(
+    models: Models, head: Head, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Whatever the photo's brightness, S_f and V_f see a face whose mean is `MEAN_RADIANCE`."""
     seen: list[Tensor] = []
+    monkeypatch.setattr("facerf_cli.light.estimate._STEPS", 1)
 
     class Features:
         def layers(self, linear: Tensor) -> list[Tensor]:
