@@ -58,14 +58,9 @@ def test_an_image_is_relit_with_its_matte(package: ModuleType) -> None:
     nodes = package.NODE_CLASS_MAPPINGS
     pixels = read_image(ROOT / "examples/astronaut.jpg").pixels[::2, ::2]
     photo = torch.from_numpy(pixels.clip(0, 1) ** (1 / 2.2))[None]
-    results = []
-    for azimuth in (-60.0, 60.0):
-        (light,) = nodes["FacerfLight"]().make(azimuth, 10.0, 1.0, 1.0, 1.0)
-        results.append(nodes["FacerfRelight"]().relight(photo, light, 0.5))
-    (left, matte), (right, _) = results
-    assert left.shape == photo.shape and matte.shape == photo.shape[:3]
-    assert 0.2 < matte.mean() < 0.8 and left.min() >= 0 and left.max() <= 1
-    face = slice(35, 85), slice(88, 138)  # of the astronaut, whose middle is at 113
-    half = [one[0, face[0], face[1]].mean((0, 2)) for one in (left, right)]
-    assert half[0][:20].mean() > 1.5 * half[1][:20].mean()
-    assert half[1][-20:].mean() > 1.5 * half[0][-20:].mean()
+    (light,) = nodes["FacerfLight"]().make(-60.0, 10.0, 1.0, 1.0, 1.0)
+    relit, matte = nodes["FacerfRelight"]().relight(photo, light, 0.5)
+    assert relit.shape == photo.shape and matte.shape == photo.shape[:3]
+    assert 0.2 < matte.mean() < 0.8 and relit.min() >= 0 and relit.max() <= 1
+    face = relit[0, 35:85, 88:138].mean((0, 2))  # of the astronaut, whose middle is at 113
+    assert face[:20].mean() > 1.5 * face[-20:].mean()
