@@ -122,13 +122,14 @@ def test_a_texel_averages_over_the_pixels_that_it_covers() -> None:
 
 def test_texels_behind_the_nose_are_hidden_and_those_before_are_not() -> None:
     vertices = head((25.0, 0, 0))
-    _, visible = unwrap(torch.ones(3, 220, 300), vertices, TRIANGLES, CAMERA, 64)
-    points = bake_attributes(vertices, SIDE, 64).permute(1, 2, 0)
-    normals = normal_map(vertices, TRIANGLES, 64).permute(1, 2, 0)
+    _, visible = unwrap(torch.ones(3, 220, 300), vertices, TRIANGLES, CAMERA, 96)
+    visible = visible[::2]  # every other row, as `first_hit` is slow
+    points = bake_attributes(vertices, SIDE, 96).permute(1, 2, 0)[::2]
+    normals = normal_map(vertices, TRIANGLES, 96).permute(1, 2, 0)[::2]
     cosine = -(normals * torch.nn.functional.normalize(points, dim=-1)).sum(-1)
     free = first_hit(vertices, points)
     hidden, seen = visible[~free & (cosine > 0.2)], visible[free & (cosine > 0.4)]
-    assert len(hidden) > 20 and len(seen) > 1800
+    assert len(hidden) > 25 and len(seen) > 2250
     # Only along the shadow's rim may the mask be off, by a texel.
     assert (hidden > 0.1).float().mean() < 0.1 and (seen < 0.9).float().mean() < 0.01
     assert visible[cosine < 0.1].max() < 0.01
