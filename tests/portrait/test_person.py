@@ -8,6 +8,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 import torch
+from scipy.ndimage import binary_erosion
 
 from facerf_cli.batch.inputs import Item
 from facerf_cli.errors import InputError, UsageError
@@ -155,7 +156,7 @@ def test_relight_takes_them_and_says_where_they_are_for_nothing(
     assert main([*line, *given, "--aov", "normal"]) == 0
     layer = exr_layers(tmp_path / "astronaut_light_50_10.exr")
     found = np.stack([layer[f"normal.{name}"] for name in "XYZ"], -1)
-    inside = shown(person, bumpy)[::2, ::2]
+    inside = binary_erosion(shown(person, bumpy)[::2, ::2], iterations=3)  # mattes of two sizes differ
     assert np.abs(found - bumpy[::2, ::2])[inside].max() < 2e-3
     for more, said in (
         (["--reflectance", "field"], "--normals-from: "),
