@@ -144,9 +144,9 @@ def test_the_whole_person_and_the_faces_own_field_have_the_same_white() -> None:
     toward = torch.nn.functional.normalize(torch.tensor([[0.6, 0.3, 0.8]]), dim=1)
     # Also the network's own field, without a ratio image.
     balanced, plain = (
-        reflectance_of(astronaut.models(), astronaut.head(), "field", network_alone=True, white_balance=mode).relit(
-            toward, torch.ones(1, 1, 3)
-        )
+        reflectance_of(
+            astronaut.models(), astronaut.head(), "field", network_alone=True, white_balance=mode
+        ).relit(toward, torch.ones(1, 1, 3))
         for mode in ("keep", None)
     )
     ratio = (balanced / plain.clamp_min(1e-6))[0][:, plain[0].amin(0) > 0.01]
