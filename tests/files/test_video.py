@@ -5,14 +5,16 @@ import struct
 import sys
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from facerf_cli.errors import InputError, UsageError
+from facerf_cli.errors import FacerfError, InputError, UsageError
+from facerf_cli.files.atomic import is_temporary
 from facerf_cli.files.read import read_image
-from facerf_cli.files.video import Timing, Video, video_timing
+from facerf_cli.files.video import StoredFrames, Timing, Video, video_timing
 from facerf_cli.files.video_writer import write_video
 from facerf_cli.files.write import write_display
 from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear, to_linear_rec709
@@ -67,12 +69,10 @@ def test_colours_and_order_come_back(tmp_path: Path, suffix: str, kind: type, mo
     with av.open(str(path)) as container:
         assert container.metadata["comment"] == "Synthetic: a test"
     assert b"Synthetic: a test" in path.read_bytes()  # as a later run looks for it
-    video = Video(path)
-    timing = video.timing
-    assert video.read(0).shape == (36, 50, 3) and len(timing.times_s) == 5 and timing.sound is None
-    assert timing.rate == Fraction(30000, 1001)
-    for number in (3, 0, 4, 1, 2, 2):  # in any order
-        frame = video.read(number)
+    frames, timing = list(Video(path).frames()), video_timing(path)
+    assert frames[0].shape == (36, 50, 3) and len(frames) == len(timing.times_s) == 5
+    assert timing.sound is None and timing.rate == Fraction(30000, 1001)
+    for number, frame in enumerate(frames):
         assert frame.dtype == kind
         # YCbCr of limited range has steps of 1 / 219 in 8 bits, and H.264 rounds once more
         found, steps = frame[8:-8, 8:-8].mean((0, 1)) / most, 1.6 if most == 255 else 0.6
@@ -82,8 +82,7 @@ def test_colours_and_order_come_back(tmp_path: Path, suffix: str, kind: type, mo
 def test_an_odd_size_is_made_even_and_uneven_times_are_kept(tmp_path: Path) -> None:
     path = tmp_path / "video.mp4"
     write_video(path, images_of(tmp_path, (35, 49)), Timing.steady(5, Fraction(24)), "")
-    video = Video(path)
-    assert video.read(0).shape == (36, 50, 3)
+    assert next(Video(path).frames()).shape == (36, 50, 3)
     times_s = tuple(map(Fraction, ("0", "1/30", "1/10", "1/5", "1/2")))
     write_video(path, images_of(tmp_path), Timing(times_s, Fraction(20)), "")
     assert [float(time_s) for time_s in video_timing(path).times_s] == pytest.approx(
@@ -211,7 +210,7 @@ SHOWN = QUARTERS.repeat(32, 0).repeat(48, 1)
 def quarters_of(path: Path) -> tuple[np.ndarray, tuple[int, ...]]:
     """The levels of the quarters, decoded by the video's space and encoded as sRGB; and the frame's shape."""
     video = Video(path)
-    frame = video.read(0)
+    frame = next(video.frames())
     linear = to_linear_rec709(frame, video.space)
     height, width = frame.shape[:2]
     at = np.s_[height // 4 :: height // 2, width // 4 :: width // 2]
@@ -284,8 +283,7 @@ def bands() -> np.ndarray:
 def test_alpha_is_read(tmp_path: Path, name: str, codec: str, form: str) -> None:
     """White is white in any number of bits, and the colour under alpha stays."""
     options = {"profile": "4"} if codec == "prores_ks" else {}
-    video = Video(video_of(tmp_path / name, codec, form, [bands()] * 3, **options))
-    frame = video.read(2)
+    *_, frame = Video(video_of(tmp_path / name, codec, form, [bands()] * 3, **options)).frames()
     most = np.iinfo(frame.dtype).max
     assert most == (65535 if "10" in form else 255)
     found = frame[:, [4, 40, 92], 3] / most
@@ -300,12 +298,10 @@ def test_alpha_is_written(tmp_path: Path) -> None:
     image = write_png(tmp_path / "a.png", bands())
     for name in ("a.mov", "a.mp4"):
         write_video(tmp_path / name, [image], Timing.steady(1, Fraction(24)), "")
-    video = Video(tmp_path / "a.mov")
-    kept = video.read(0) / 65535
+    kept = next(Video(tmp_path / "a.mov").frames()) / 65535
     np.testing.assert_allclose(kept[:, [8, 40, 88], 3], [[0, 128 / 255, 1]] * 64, atol=1 / 1023)
     np.testing.assert_allclose(kept[16::32, 24::48, :3], QUARTERS / 255, atol=4 / 255)
-    video = Video(tmp_path / "a.mp4")
-    shown = video.read(0) / 255
+    shown = next(Video(tmp_path / "a.mp4").frames()) / 255
     alpha = np.array([0, 128 / 255, 1])
     expected = linear_to_srgb(srgb_to_linear(SHOWN[:, [8, 40, 88]] / 255) * alpha[:, None])
     np.testing.assert_allclose(shown[8:24, [8, 40, 88]], expected[8:24], atol=4 / 255)
@@ -328,8 +324,7 @@ def test_interlaced_frames_become_progressive(tmp_path: Path, name: str) -> None
     path = video_of(tmp_path / name, "libx264", "yuv420p", frames, **coded)
     video = Video(path)
     assert len(video.timing.times_s) == 11
-    read = [video.read(number) for number in range(11)]
-    for number, frame in enumerate(read):
+    for number, frame in enumerate(video.frames()):
         inside = np.s_[4:60]  # at the edge of the first frame bwdif has too little to go by
         np.testing.assert_allclose(frame[inside], bars(number, 0)[inside], atol=5)
 
@@ -342,14 +337,12 @@ def test_interlaced_frames_are_the_same_in_any_order_and_progressive_ones_not_fi
     frames = list(noise.repeat(3, 3).repeat(3, 0).repeat(2, 1).repeat(2, 2))
     coded = {"x264-params": "interlaced=1:scenecut=0:bframes=0", "g": "3"}
     path = video_of(tmp_path / "a.mp4", "libx264", "yuv420p", frames, **coded)
-    video = Video(path)
-    other = Video(path)
-    inside = [video.read(number) for number in range(6)]
-    np.testing.assert_array_equal(other.read(3), inside[3])
+    inside = list(Video(path).frames())
+    np.testing.assert_array_equal(StoredFrames(Video(path), tmp_path / "out").read(3), inside[3])
     assert np.abs(inside[3].astype(int) - inside[4]).max() > 9  # what is before counts
     frames = [bars(number, 1) for number in range(3)]  # combs that nothing states
-    video = Video(video_of(tmp_path / "a.mp4", "libx264", "yuv444p", frames, crf="1"))
-    np.testing.assert_allclose(video.read(1), frames[1], atol=5)
+    read = list(Video(video_of(tmp_path / "a.mp4", "libx264", "yuv444p", frames, crf="1")).frames())
+    np.testing.assert_allclose(read[1], frames[1], atol=5)
 
 
 @pytest.mark.parametrize(
@@ -370,30 +363,53 @@ def test_containers(tmp_path: Path, name: str, codec: str, form: str) -> None:
     path = video_of(tmp_path / name, codec, form, frames, bf="2", g="6", b="4M")
     video = Video(path)
     assert video.timing.times_s == tuple(Fraction(number, 25) for number in range(20))
-    for number in (*range(20), 19, 7, 0, 13):
-        assert video.read(number).mean() == pytest.approx(12 * number, abs=4)
+    means = [frame.mean() for frame in video.frames()]
+    np.testing.assert_allclose(means, 12 * np.arange(20), atol=4)
 
 
-def test_frames_are_decoded_in_order_by_few_readers(tmp_path: Path, monkeypatch: Patch) -> None:
-    """Key frames, the middle and all frames of each take, in turn, take three passes in all."""
+def test_stored_frames_are_decoded_in_order_by_two_readers(tmp_path: Path, monkeypatch: Patch) -> None:
+    """Key frames, the middle and all frames of each take, in turn, take two passes in all."""
     frames = [np.full((64, 96, 3), 3 * number, np.uint8) for number in range(80)]
     video = Video(video_of(tmp_path / "a.mp4", "libx264", "yuv420p", frames, bf="2", g="6"))
-    passes, decoded = [], video._decoded
-    monkeypatch.setattr(video, "_decoded", lambda: passes.append(1) or decoded())
-    for take in (range(40), range(40, 80)):
-        for number in (*take[::10], take.start + 20, *take):
-            for near in (number, max(number - 4, take.start), min(number + 2, take.stop - 1)):
-                assert video.read(near).mean() == pytest.approx(3 * near, abs=2.5)
-            assert len(video._kept) <= 12
-    assert len(passes) == 3
+    passes, decoded = [], video.decoded
+    monkeypatch.setattr(video, "decoded", lambda: passes.append(1) or decoded())
+    stored = StoredFrames(video, tmp_path / "out" / "me")
     gc.collect()
     gc.disable()
     held = 0
-    for number in range(80):
-        video.read(number)
-        held = max(held, sum(type(one) is av.VideoFrame for one in gc.get_objects()))
+    for take in (range(40), range(40, 80)):
+        for number in (take.start, *take[::10], take.start + 20, *take):
+            for near in (number, max(number - 4, take.start), min(number + 4, take.stop - 1)):
+                assert stored.read(near).mean() == pytest.approx(3 * near, abs=2.5)
+            if number % 20 == 19:
+                held = max(held, sum(type(one) is av.VideoFrame for one in gc.get_objects()))
     gc.enable()
-    assert held < 40, "frames are let go at once"
+    assert len(passes) == 2 and held < 40, "frames are let go at once"
+    (folder,) = (tmp_path / "out").iterdir()
+    assert is_temporary(folder) and len(list(folder.iterdir())) == 64
+    del stored
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_a_disk_without_room_for_frames_is_an_error(tmp_path: Path, monkeypatch: Patch) -> None:
+    video = Video(video_of(tmp_path / "a.mp4", "libx264", "yuv420p", [SHOWN]))
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=64 * SHOWN.size - 1))
+    refused(FacerfError, "choose another -o", StoredFrames(video, tmp_path / "out").read, 0)
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=64 * SHOWN.size))
+    assert StoredFrames(video, tmp_path / "out").read(0).shape == SHOWN.shape
+
+
+def test_alpha_that_ffmpeg_does_not_decode_is_one_line(tmp_path: Path, caplog: Log) -> None:
+    with av.open(str(tmp_path / "a.webm"), "w") as container:
+        stream = container.add_stream("libvpx-vp9", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuva420p"
+        stream.metadata["alpha_mode"] = "1"
+        container.mux(
+            [*stream.encode(av.VideoFrame.from_ndarray(bands(), format="rgba")), *stream.encode(None)]
+        )
+    video_timing(tmp_path / "a.webm")
+    (line,) = [record.getMessage() for record in caplog.records]
+    assert "a.webm: alpha" in line and "convert it to ProRes 4444" in line
 
 
 def with_sounds(path: Path, tones: list[tuple[str, int, float, float]], late_s: int = 0) -> Path:
