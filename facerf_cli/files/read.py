@@ -165,7 +165,7 @@ def decode(
         raise InputError(f"{path}: the file is empty; specify an image file")
     for _ in workarounds.png_chunks(path):  # checks all of them
         pass
-    with open_image(path, layer, limit_px, kept_px) as image:
+    with open_image(path, layer, limit_px) as image:
         form, spec = image.form, image.spec
         if image.choice:
             log.info("%s: %s", path, image.choice)
@@ -197,18 +197,17 @@ def decode(
 
 
 @contextmanager
-def open_image(path: Path, layer: str | None = None, limit_px: int = 0, kept_px: int = 0) -> Iterator[Opened]:
+def open_image(path: Path, layer: str | None = None, limit_px: int = 0) -> Iterator[Opened]:
     """Open an image file at a layer, by default the main image.
 
-    A HEIF is decoded when it is opened, if it has at most `limit_px` pixels and fits the memory budget.
+    A HEIF is decoded when it is opened, if it has at most `limit_px` pixels.
     Raises InputError for unknown and rare formats, camera raw files and missing layers.
     """
     if path.suffix.lower() in workarounds.RAW_SUFFIXES:
         raise InputError(f"{path}: {workarounds.UNDEVELOPED}")
     if form := isobmff.kind_of(path):
-        room_px = memory.left_bytes() // (LINEAR_BYTES + max(isobmff.HEIF_BYTES, kept_px))
-        is_avif, most_px = form == "avif", min(limit_px, room_px)
-        spec, decode_all = isobmff.open_avif(path) if is_avif else isobmff.open_heif(path, most_px)
+        is_avif = form == "avif"
+        spec, decode_all = isobmff.open_avif(path) if is_avif else isobmff.open_heif(path, limit_px)
         yield Opened(form, spec, *first_channels(spec), lambda first, past: decode_all()[..., first:past])
         return
     settings = oiio.ImageSpec()
