@@ -10,7 +10,6 @@ import shutil
 import struct
 import zlib
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -20,9 +19,8 @@ import OpenImageIO as oiio
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.read import metadata_of, open_image, shown_size
-from facerf_cli.files.spaces import default_space, is_floating, stated_space
+from facerf_cli.files.spaces import is_floating
 from facerf_cli.files.workarounds import utf8_path
-from facerf_cli.image.colour import ColourSpace
 
 Attributes = Mapping[str, str | int | float]
 
@@ -48,13 +46,12 @@ _TUPLES = {"smpte:TimeCode": "timecode", "smpte:KeyCode": "keycode"}
 
 @dataclass(frozen=True)
 class Header:
-    """Upright size, number format, colour space and metadata."""
+    """Upright size, number format and metadata."""
 
     width_px: int
     height_px: int
     is_floating: bool
     bits: int  # per value
-    space: ColourSpace  # stated, or linear Rec.709 for floats and sRGB for integers
     metadata: dict[str, Any]
 
 
@@ -68,11 +65,8 @@ def read_header(path: Path) -> Header | None:
             spec = opened.spec
     except InputError:  # not an image, damaged, or pi-heif is missing
         return None
-    space = default_space(spec)
-    with suppress(InputError):  # an HDR image, whose pixels are not supported
-        space = stated_space(path, spec) or space
     height, width = shown_size(spec)
-    return Header(width, height, is_floating(spec), 8 * spec.format.size(), space, metadata_of(spec))
+    return Header(width, height, is_floating(spec), 8 * spec.format.size(), metadata_of(spec))
 
 
 def plate_metadata(metadata: Mapping[str, Any]) -> dict[str, Any]:
