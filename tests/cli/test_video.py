@@ -318,27 +318,6 @@ def test_a_sequence_with_a_hole_is_said(
         assert said.out == "" and len(names(tmp_path)) == 3
 
 
-def test_a_video_of_a_sequence_has_the_rate_and_the_timecode_of_its_headers(
-    given: Path, tmp_path: Path
-) -> None:
-    for number in range(2):
-        stated: dict[str, Any] = {
-            "framesPerSecond": (24000, 1001),
-            "smpte:TimeCode": (0x01020304 + number, 0),
-        }
-        path = tmp_path / f"plates/me_{number}.exr"
-        path.parent.mkdir(exist_ok=True)
-        write_exr(path, (frame_of(number) / np.float32(255)) ** np.float32(2.2), metadata=stated)
-    line = (tmp_path / "plates", "--sequence", "--light", "70,20", *CHEAP)
-    assert facerf(given, "relight", *line, "-o", tmp_path / "me.mov") == 0
-    assert facerf(given, "relight", tmp_path / "me.mov", *line[2:], "-o", tmp_path / "again.mp4") == 0
-    for name in ("me.mov", "again.mp4"):
-        with av.open(str(tmp_path / name)) as container:
-            stream = container.streams.video[0]
-            assert stream.average_rate == Fraction(24000, 1001)
-            assert stream.metadata["timecode"] == "01:02:03:04"
-
-
 @pytest.mark.parametrize(
     ("stated", "given_rate", "timecode", "expected"),
     [
