@@ -40,27 +40,6 @@ def images_of(folder: Path, size: tuple[int, int] = (36, 50), bits: int = 8) -> 
     return paths
 
 
-def with_sound(path: Path, codec: str, frames: int = 30, rate: int = 25) -> Path:
-    """A grey video with a tone."""
-    with av.open(str(path), "w") as container:
-        pictures = container.add_stream("libvpx-vp9" if path.suffix == ".webm" else "libx264", rate=rate)
-        pictures.width, pictures.height, pictures.pix_fmt = 48, 32, "yuv420p"
-        tone = container.add_stream(codec, rate=48000, layout="mono")
-        for number in range(frames):
-            frame = av.VideoFrame.from_ndarray(np.full((32, 48, 3), 8 * number, np.uint8))
-            frame.pts, frame.time_base = number, Fraction(1, rate)
-            container.mux(pictures.encode(frame))
-        container.mux(pictures.encode(None))
-        wave = 0.3 * np.sin(np.arange(48000 * frames // rate) * 0.06).astype(np.float32)
-        resampler = av.AudioResampler(tone.format.name, "mono", 48000, frame_size=960)
-        sound = av.AudioFrame.from_ndarray(wave[None], "fltp", "mono")
-        sound.sample_rate, sound.pts, sound.time_base = 48000, 0, Fraction(1, 48000)
-        for part in (*resampler.resample(sound), *resampler.resample(None)):
-            container.mux(tone.encode(part))
-        container.mux(tone.encode(None))
-    return path
-
-
 @pytest.mark.parametrize(("suffix", "kind", "most"), [(".mp4", np.uint8, 255), (".mov", np.uint16, 65535)])
 def test_colours_and_order_come_back(tmp_path: Path, suffix: str, kind: type, most: int) -> None:
     images = images_of(tmp_path, bits=16 if suffix == ".mov" else 8)
@@ -121,31 +100,6 @@ def test_timecode_is_kept(
     write_video(tmp_path / made, images_of(tmp_path)[:2], video_timing(tmp_path / name), "")
     found = video_timing(tmp_path / made)
     assert (found.timecode, found.rate) == ("" if timecode[0] == "n" else timecode, Fraction(rate))
-
-
-@pytest.mark.parametrize(
-    ("source", "codec", "made", "kept"),
-    [
-        ("a.mp4", "aac", "b.mp4", "aac"),
-        ("a.webm", "libopus", "b.mp4", "opus"),
-        ("a.webm", "libopus", "b.mov", "aac"),
-    ],
-)
-def test_sound_is_kept(tmp_path: Path, source: str, codec: str, made: str, kept: str) -> None:
-    timing = video_timing(with_sound(tmp_path / source, codec))
-    images = images_of(tmp_path)
-    path = tmp_path / made
-    write_video(path, [images[n % 5] for n in range(len(timing.times_s))], timing, "")
-    with av.open(str(path)) as container:
-        (track,) = container.streams.audio
-        assert track.codec_context.name == kept
-        loud = np.concatenate([frame.to_ndarray().ravel() for frame in container.decode(track)])
-    assert len(loud) == pytest.approx(48000 * 30 / 25, rel=0.06)
-    assert (
-        0.1
-        < np.abs(loud[4800:-4800].astype(np.float64)).mean() / (1 if loud.dtype.kind == "f" else 32768)
-        < 0.3
-    )
 
 
 def test_a_video_that_cannot_be_finished_is_not_there(tmp_path: Path) -> None:
@@ -442,9 +396,9 @@ def heard(path: Path) -> list[tuple[str, int, str | None, float, float]]:
     for number in range(count):
         with av.open(str(path)) as container:
             track = container.streams.audio[number]
-            wave = np.concatenate([frame.to_ndarray().ravel() for frame in container.decode(track)]).astype(
-                float
-            )
+            wave = np.concatenate([frame.to_ndarray().ravel() for frame in container.decode(track)])
+            wave = wave / (32768 if wave.dtype.kind == "i" else 1)
+            assert 0.1 < np.abs(wave).mean() < 0.2  # a tone of amplitude 0.3, and some silence
             coded, rate = track.codec_context, track.codec_context.sample_rate
             loudest = np.abs(np.fft.rfft(wave)).argmax() * rate / len(wave)
             found.append((coded.name, rate, track.language, loudest, len(wave) / rate))
@@ -458,6 +412,8 @@ def heard(path: Path) -> list[tuple[str, int, str | None, float, float]]:
         ([("aac", 44100, 440, 2.0)], "b.mp4", [("aac", 44100)]),
         ([(PCM, 192000, 440, 1.0), (PCM, 48000, 880, 2.0)], "b.mp4", [("aac", 96000), ("aac", 48000)]),
         ([(PCM, 5000, 440, 1.0)], "b.mp4", [("aac", 7350)]),
+        ([("libopus", 48000, 440, 0.5)], "b.mp4", [("opus", 48000)]),
+        ([("libopus", 48000, 440, 0.5)], "b.mov", [("aac", 48000)]),
         ([(PCM, 192000, 440, 1.0), (PCM, 50000, 880, 0.5)], "b.mov", [(PCM, 192000), (PCM, 50000)]),
     ],
 )
@@ -465,7 +421,8 @@ def test_all_sound_is_kept(
     tmp_path: Path, tones: list[tuple[str, int, float, float]], made: str, codecs: list[tuple[str, int]]
 ) -> None:
     """Every track, as long as it is, at a rate that the codec takes."""
-    timing, path = video_timing(with_sounds(tmp_path / "a.mov", tones)), tmp_path / made
+    source = tmp_path / ("a.mkv" if tones[0][0] == "libopus" else "a.mov")
+    timing, path = video_timing(with_sounds(source, tones)), tmp_path / made
     write_video(path, images_of(tmp_path)[:2], timing, "")
     found = heard(path)
     assert [one[:2] for one in found] == codecs
