@@ -24,7 +24,6 @@ from facerf_cli.face.importers.ict import read_ict_facekit
 from facerf_cli.face.landmarks import read_landmarks
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
-from facerf_cli.files.arrays import read_array
 from facerf_cli.files.documents import read_rig
 from facerf_cli.files.icc import space_of_profile
 from facerf_cli.files.image_metadata import read_header
@@ -33,7 +32,7 @@ from facerf_cli.files.light_files import (
 )
 from facerf_cli.files.olat_stack import is_olat_stack, read_olat_header, read_olats
 from facerf_cli.files.output_options import parse_exposure
-from facerf_cli.files.read import read_image
+from facerf_cli.files.read import read_array, read_image
 from facerf_cli.files.texts import read_light_list
 from facerf_cli.light.entries import lit_images, parse_lights
 from facerf_cli.main import app, read_config

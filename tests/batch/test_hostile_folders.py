@@ -13,9 +13,8 @@ from facerf_cli.batch.run import _exist, print_path
 from facerf_cli.errors import InputError
 from facerf_cli.face.fit import load_fit
 from facerf_cli.face.landmarks import read_landmarks
-from facerf_cli.files.arrays import read_array
 from facerf_cli.files.olat_stack import is_olat_stack
-from facerf_cli.files.read import decode
+from facerf_cli.files.read import decode, read_array
 from facerf_cli.files.texts import is_regular, read_light_list, read_toml, require_regular
 from facerf_cli.run.logs import json_line, printable_line
 from tests.batch.toy_batch import run
