@@ -555,12 +555,3 @@ def test_options_that_a_video_cannot_have(
     assert main(["relight", *filled]) == 2
     assert message in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
-
-
-def test_a_video_in_a_folder_of_photos_is_left_alone(given: Path, tmp_path: Path, capsys: Said) -> None:
-    shutil.copy(given / "me.mp4", tmp_path / "live.mp4")
-    shutil.copy(PHOTO, tmp_path / "me.jpg")
-    assert main(["relight", str(tmp_path), "--light", "0,0", "-o", str(tmp_path / "out"), "--dry-run"]) == 0
-    assert {line.split(" -> ")[0] for line in capsys.readouterr().out.splitlines()} == {
-        str(tmp_path / "me.jpg")
-    }

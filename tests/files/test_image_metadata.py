@@ -12,7 +12,7 @@ from PIL import Image
 from facerf_cli.files.image_metadata import embed_xmp, plate_metadata, read_header, xmp_packet
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_display, write_exr, write_tiff
-from facerf_cli.image.colour import ACES, ACESCG, LINEAR, LINEAR_P3, LINEAR_REC2020, ColourSpace
+from facerf_cli.image.colour import LINEAR
 from facerf_cli.run.logs import COMPOSITE_SOURCE_TYPE, Provenance
 from tests.files.made import IPTC, properties, write_oiio
 
@@ -33,15 +33,6 @@ def test_size_kind_and_space_upright(tmp_path: Path) -> None:
 
 def write_primaries(path: Path, chromaticities: tuple[float, ...]) -> Path:
     return write_oiio(path, np.full((6, 9, 3), 0.5, np.float32), "half", chromaticities=chromaticities)
-
-
-@pytest.mark.parametrize(
-    "space", [ACES, ACESCG, LINEAR, LINEAR_P3, LINEAR_REC2020], ids=lambda space: space.name
-)
-def test_known_primaries_get_their_name(tmp_path: Path, space: ColourSpace) -> None:
-    assert space.chromaticities is not None
-    path = write_primaries(tmp_path / "a.exr", space.chromaticities)
-    assert read_image(path).colourspace_name == space.name
 
 
 @pytest.mark.parametrize(

@@ -283,18 +283,8 @@ def test_interlaced_frames_become_progressive(tmp_path: Path, name: str) -> None
         np.testing.assert_allclose(frame[inside], bars(number, 0)[inside], atol=5)
 
 
-def test_interlaced_frames_are_the_same_in_any_order_and_progressive_ones_not_filtered(
-    tmp_path: Path,
-) -> None:
-    """The first frame after a cut is coded without others, and made progressive with the one before."""
-    noise = np.random.default_rng(8).integers(0, 256, (2, 32, 48, 1), np.uint8)
-    frames = list(noise.repeat(3, 3).repeat(3, 0).repeat(2, 1).repeat(2, 2))
-    coded = {"x264-params": "interlaced=1:scenecut=0:bframes=0", "g": "3"}
-    path = video_of(tmp_path / "a.mp4", "libx264", "yuv420p", frames, **coded)
-    inside = list(Video(path).frames())
-    np.testing.assert_array_equal(StoredFrames(Video(path), tmp_path / "out").read(3), inside[3])
-    assert np.abs(inside[3].astype(int) - inside[4]).max() > 9  # what is before counts
-    frames = [bars(number, 1) for number in range(3)]  # combs that nothing states
+def test_frames_that_are_not_marked_as_interlaced_are_not_filtered(tmp_path: Path) -> None:
+    frames = [bars(number, 1) for number in range(3)]
     read = list(Video(video_of(tmp_path / "a.mp4", "libx264", "yuv444p", frames, crf="1")).frames())
     np.testing.assert_allclose(read[1], frames[1], atol=5)
 
