@@ -13,6 +13,7 @@ import hashlib
 import logging
 import os
 import platform
+import re
 import secrets
 import shutil
 import time
@@ -26,6 +27,7 @@ from facerf_cli.run.stopping import clean_by, end_again
 
 _ABANDONED_S = 24 * 3600  # age of another machine's temporary folder that counts as abandoned
 _MARK = ".part-"  # start of a temporary folder's name
+_TEMPORARY = re.compile(r"\.part-([0-9a-f]{8})-(\d+)-[0-9a-f]+")  # with its machine and process
 # Errors of one output's path, which fail its item; others, such as a full disk, end the run.
 _OF_ONE_PATH = {errno.ENAMETOOLONG, errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.EILSEQ}
 _NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS}  # NFS, SMB and Lustre without them
@@ -117,7 +119,7 @@ def sweep_leftovers(folder: Path) -> None:
     """Remove temporary folders of ended processes from a folder."""
     with suppress(OSError):
         for entry in os.scandir(folder):
-            if entry.name.startswith(_MARK) and _is_abandoned(entry):
+            if _is_abandoned(entry):
                 _remove(Path(entry.path))
 
 
@@ -132,7 +134,7 @@ def is_temporary(path: Path) -> bool:
 
 
 clean_by(_remove_own)
-atexit.register(_remove_own)  # again, after a Ctrl-C during the removal
+atexit.register(_remove_own)  # folders that are still in use, and after a Ctrl-C during a removal
 
 
 def machine_id() -> str:
@@ -141,14 +143,16 @@ def machine_id() -> str:
 
 
 def _is_abandoned(leftover: os.DirEntry[str]) -> bool:
+    if (match := _TEMPORARY.fullmatch(leftover.name)) is None:
+        return False
+    machine, owner = match.groups()
     try:
-        machine, owner, _ = leftover.name.removeprefix(_MARK).split("-")
         if machine != machine_id():
             return time.time() - leftover.stat(follow_symlinks=False).st_mtime > _ABANDONED_S
         os.kill(int(owner), 0)
-    except ProcessLookupError:
+    except (ProcessLookupError, OverflowError):
         return True
-    except (OSError, ValueError, OverflowError):  # another user's process, just removed, or another name
+    except OSError:  # another user's process, or a folder that was just removed
         pass
     return False
 

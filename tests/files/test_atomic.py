@@ -42,9 +42,11 @@ def test_leftovers_of_a_killed_process_go_with_the_next_write(tmp_path: Path) ->
         tmp_path / f".part-{elsewhere}-00ff",
         tmp_path / f".part-{alive}-00ff",
         tmp_path / ".part-x",
+        tmp_path / ".part-of-a-song",
     ]
     for path in kept:
         path.mkdir()
+    os.utime(kept[-1], (0, 0))
     with atomic_path(tmp_path / "a.exr") as temporary:
         temporary.write_text("whole")
     with atomic_path(tmp_path / "folder") as temporary:
