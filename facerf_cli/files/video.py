@@ -214,7 +214,7 @@ class StoredFrames:
             except OSError as error:
                 raise FacerfError(f"{self._folder}: cannot store frames: {error.strerror}") from None
         self._stored[number] = path = self._stored.pop(number)
-        return np.asarray(np.load(path))
+        return np.asarray(np.load(path, mmap_mode="r"))
 
     def _decode(self, number: int) -> None:
         """Store a frame and its neighbours."""
