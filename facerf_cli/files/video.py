@@ -198,7 +198,7 @@ class StoredFrames:
     """
 
     def __init__(self, video: Video, output: Path) -> None:
-        self._video, self._hidden = video, hidden_folder(output)
+        self._video, self._output, self._hidden = video, output, hidden_folder(output)
         self._stored: dict[int, Path] = {}  # least recently used first, as the readers
         self._readers: dict[int, Iterator[Any]] = {}  # by the number of their next frame
 
@@ -212,7 +212,7 @@ class StoredFrames:
             try:
                 self._decode(number)
             except OSError as error:
-                raise FacerfError(f"{self._folder}: cannot store frames: {error.strerror}") from None
+                raise FacerfError(f"{self._output.parent}: cannot store frames: {error.strerror}") from None
         self._stored[number] = path = self._stored.pop(number)
         return np.asarray(np.load(path, mmap_mode="r"))
 
@@ -223,23 +223,24 @@ class StoredFrames:
         past = min(number + _REACH + 1, len(self._video.timing.times_s))
         for at, frame in zip(range(start, past), frames, strict=False):
             if at >= number - _REACH:
-                self._store(at, self._video.pixels(frame))
+                path = self._stored.pop(at, None)
+                self._stored[at] = path or self._saved(at, self._video.pixels(frame))
+            if len(self._stored) > _MOST_STORED:
+                self._stored.pop(next(iter(self._stored))).unlink()
         self._readers[past] = frames
         if len(self._readers) > _READERS:
             del self._readers[next(iter(self._readers))]
 
-    def _store(self, number: int, pixels: np.ndarray) -> None:
+    def _saved(self, number: int, pixels: np.ndarray) -> Path:
+        """Save a frame; for the first, raise FacerfError if the disk has no room for 64."""
         needed, folder = _MOST_STORED * pixels.nbytes, self._folder
         if not self._stored and (free := shutil.disk_usage(folder).free) < needed:
             raise FacerfError(
                 f"{folder.parent}: {free / 1e9:.1f} GB are free, but decoding a video needs"
                 f" {needed / 1e9:.1f} GB; remove files, or choose another -o"
             )
-        self._stored.pop(number, None)
-        self._stored[number] = folder / f"{number}.npy"
-        np.save(self._stored[number], pixels)
-        if len(self._stored) > _MOST_STORED:
-            self._stored.pop(next(iter(self._stored))).unlink()
+        np.save(path := folder / f"{number}.npy", pixels)
+        return path
 
 
 def _upright(values: np.ndarray, matrix: bytes) -> np.ndarray:

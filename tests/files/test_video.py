@@ -341,6 +341,8 @@ def test_a_disk_without_room_for_frames_is_an_error(tmp_path: Path, monkeypatch:
     refused(FacerfError, "choose another -o", StoredFrames(video, tmp_path / "out").read, 0)
     monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=64 * SHOWN.size))
     assert StoredFrames(video, tmp_path / "out").read(0).shape == SHOWN.shape
+    (tmp_path / "file").touch()
+    refused(FacerfError, "cannot store frames", StoredFrames(video, tmp_path / "file" / "me").read, 0)
 
 
 def test_alpha_that_ffmpeg_does_not_decode_is_one_line(tmp_path: Path, caplog: Log) -> None:
