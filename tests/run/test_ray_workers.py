@@ -17,11 +17,10 @@ import pytest
 from facerf_cli.batch.settings import Shard
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.run.logs import configure_logging
-from facerf_cli.run.ray_workers import _initialise, connect, in_ray
+from facerf_cli.run.ray_workers import connect, in_ray
 from tests.batch.toy_batch import run
 from tests.folders import rows
 from tests.processes import wait_until
-from tests.refusals import refused
 
 pytestmark = pytest.mark.slow
 needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="ray is not installed")
@@ -119,7 +118,6 @@ def test_a_worker_is_killed_while_it_works(
     assert len(tree(tmp_path / "out")) == len(NAMES) and not parts(tmp_path / "out")
     said = capsys.readouterr()
     assert [Path(line).name for line in said.out.splitlines()] == [f"{name[0]}_copy.bin" for name in NAMES]
-    assert said.err.count("a worker was lost; its item is tried again") == 1
     assert said.err.count("warning: at ") == len(NAMES) and "Traceback" not in said.err
 
 
@@ -242,11 +240,3 @@ def test_a_lost_cluster_is_one_line_that_says_what_to_do(when: str, monkeypatch:
         FacerfError, match=r"^--ray a:1: the cluster was lost \(The node died\); start it again"
     ):
         list(in_ray(str, ["item"], lambda item, error: item, "a:1", 1, 0))
-
-
-def test_a_temporary_folder_too_deep_for_sockets_is_one_line() -> None:
-    def init(**_: object) -> None:
-        raise OSError("AF_UNIX path length cannot exceed 107 bytes: /deep")
-
-    ray = SimpleNamespace(init=init, exceptions=SimpleNamespace(RayError=RuntimeError))
-    refused(UsageError, "--ray local: TMPDIR has too long a name", _initialise, ray, "local", 1)
