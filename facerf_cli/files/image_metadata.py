@@ -17,12 +17,22 @@ from xml.sax.saxutils import quoteattr
 
 import OpenImageIO as oiio
 
+from facerf_cli._version import __version__
 from facerf_cli.errors import InputError
 from facerf_cli.files.read import metadata_of, open_image, shown_size
 from facerf_cli.files.spaces import is_floating
 from facerf_cli.files.workarounds import utf8_path
 
 Attributes = Mapping[str, str | int | float]
+
+# IPTC's digital source types (cv.iptc.org/newscodes/digitalsourcetype): changed by a trained model,
+COMPOSITE_SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/compositeWithTrainedAlgorithmicMedia"
+
+# computed entirely,
+COMPUTER_GRAPHICS_SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/algorithmicMedia"
+
+# and sums of photographs.
+_CAPTURES_SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/compositeCapture"
 
 _PNG_SIGNATURE, _JPEG_START = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 _TIFF_START, _TIFF_XMP_TAG = b"II*\0", 700
@@ -42,6 +52,47 @@ _OF_PLATE = re.compile(
     r"|expTime|isoSpeed|shutterAngle|captureRate|imageCounter)"
 )
 _TUPLES = {"smpte:TimeCode": "timecode", "smpte:KeyCode": "keycode"}
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Origin of a result, for the metadata of every output.
+
+    `face_model` and its licence are `MorphableModel.stamp`; `source_type` is '' for images that are not
+    synthetic, such as a cropped photograph.
+    """
+
+    input_name: str = ""
+    checkpoint_name: str = ""
+    face_model: str = ""
+    face_model_licence: str = ""
+    source_type: str = COMPOSITE_SOURCE_TYPE
+    key: str = ""  # of the file of `-o FILE`, so that a later run recognises it
+
+    def attributes(self) -> dict[str, str | int]:
+        """Return metadata for a file's header, without empty fields."""
+        attributes: dict[str, str | int] = {
+            "Software": f"facerf {__version__}",
+            "facerf:version": __version__,
+            "facerf:synthetic": 1 if self.source_type else "",
+            "IPTC:DigitalSourceType": self.source_type,
+            "facerf:input": self.input_name,
+            "facerf:checkpoint": self.checkpoint_name,
+            "facerf:face_model": self.face_model,
+            "facerf:face_model_licence": self.face_model_licence,
+            "facerf:key": self.key,
+        }
+        return {name: value for name, value in attributes.items() if value != ""}
+
+
+def attributes_of_sum(stack: Mapping[str, Any], stack_name: str = "", key: str = "") -> dict[str, Any]:
+    """Return metadata for weighted sums of a stack's images, from the stack's metadata.
+
+    Sums of photographs are also marked as synthetic, since their light did not exist.
+    """
+    default = Provenance(stack_name, source_type=_CAPTURES_SOURCE_TYPE)
+    of_stack = {name: value for name, value in stack.items() if name != "facerf:key"}
+    return default.attributes() | of_stack | Provenance(source_type="", key=key).attributes()
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,11 @@ from facerf_cli.capture.stage_json import STAGE_FILE, STAGE_FORMAT
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import write_document
+from facerf_cli.files.image_metadata import COMPUTER_GRAPHICS_SOURCE_TYPE, Provenance
 from facerf_cli.files.texts import read_json
 from facerf_cli.files.write import write_exr
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
-from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE, Provenance
 from facerf_cli.synth.bank.heads import cached_face_model
 from facerf_cli.synth.renderer import bake_light, images_under, view_of
 from facerf_cli.synth.stage_settings import StageSettings

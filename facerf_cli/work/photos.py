@@ -19,6 +19,7 @@ from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import Head
 from facerf_cli.face.landmarks import read_landmarks
 from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
+from facerf_cli.files.image_metadata import Provenance
 from facerf_cli.files.read import LinearImage, read_array, read_image
 from facerf_cli.image.colour import named_space, to_display
 from facerf_cli.image.strips import resized
@@ -33,7 +34,7 @@ from facerf_cli.relighting.fitting import head_of
 from facerf_cli.relighting.memory import KEPT_PX, beside
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.relighting.portrait_field import SmoothedFrame
-from facerf_cli.run.logs import LOGGER_NAME, Provenance, step
+from facerf_cli.run.logs import LOGGER_NAME, step
 from facerf_cli.run.threads import compute_apart
 from facerf_cli.work.photo_options import PhotoOptions, parse_pose
 

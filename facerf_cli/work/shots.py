@@ -272,9 +272,9 @@ class VideoOutput:
                 "%s: not written because frames failed; the others remain in %s", self.path, self.folder
             )
             return 1
+        from facerf_cli.files.image_metadata import Provenance
         from facerf_cli.files.video import Timing, Video
         from facerf_cli.files.video_writer import write_video
-        from facerf_cli.run.logs import Provenance
 
         source = shots[0].video if shots else None
         timing = Video(source).timing if source else Timing.steady(len(images), *_stated(items[0], self.rate))

@@ -11,11 +11,11 @@ import pytest
 import torch
 
 from facerf_cli.capture.layouts import read_capture
+from facerf_cli.files.image_metadata import COMPUTER_GRAPHICS_SOURCE_TYPE
 from facerf_cli.files.read import read_image
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.main import main
 from facerf_cli.portrait.parse import class_index
-from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE
 from facerf_cli.synth import stage
 from facerf_cli.synth.bank.heads import cached_face_model
 from facerf_cli.synth.stage_settings import Frame

@@ -9,11 +9,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from facerf_cli.files.image_metadata import embed_xmp, plate_metadata, read_header, xmp_packet
+from facerf_cli.files.image_metadata import (
+    COMPOSITE_SOURCE_TYPE,
+    Provenance,
+    embed_xmp,
+    plate_metadata,
+    read_header,
+    xmp_packet,
+)
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_display, write_exr, write_tiff
 from facerf_cli.image.colour import LINEAR
-from facerf_cli.run.logs import COMPOSITE_SOURCE_TYPE, Provenance
 from tests.files.made import IPTC, properties, write_oiio
 
 

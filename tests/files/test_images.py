@@ -9,11 +9,10 @@ import pytest
 import tifffile
 
 from facerf_cli.errors import FacerfError, InputError, UsageError
-from facerf_cli.files.image_metadata import read_header
+from facerf_cli.files.image_metadata import COMPOSITE_SOURCE_TYPE, Provenance, read_header
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import HALF_MAX, write_display, write_exr, write_tiff
 from facerf_cli.image import colour
-from facerf_cli.run.logs import COMPOSITE_SOURCE_TYPE, Provenance
 from tests.exr_layers import exr_layers
 from tests.files.made import IPTC, MAP, TO_709, properties, write_hdr, write_oiio
 from tests.kinds import Log
