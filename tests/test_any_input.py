@@ -166,7 +166,7 @@ def _journal(path: Path) -> None:
 
 
 def _report(path: Path) -> None:
-    write_report(path.parent, [])
+    write_report(path.parent)
 
 
 def _options(path: Path) -> None:

@@ -283,7 +283,7 @@ class VideoOutput:
         key = self._journal.key_of(items[0], recipe)
         comment = f"Synthetic: relit by a trained model; {provenance}; facerf:key={key}"
         write_video(self.path, images, timing, comment)
-        self._journal.add_file(items[0], self.path, recipe)
+        self._journal.add_file(self.path, items[0], recipe)
         frames = Journal(self.folder, "relight")
         edited = {path for path in images if frames.refusal(path)}
         records = () if edited else (*(shot.track for shot in shots), *self.folder.glob(".facerf*.jsonl"))

@@ -18,7 +18,7 @@ from facerf_cli.batch.settings import Shard
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.run.logs import configure_logging
 from facerf_cli.run.ray_workers import connect, in_ray
-from tests.batch.toy_batch import run
+from tests.batch.toy_batch import run, started
 from tests.folders import rows
 from tests.processes import wait_until
 
@@ -174,10 +174,7 @@ def test_an_error_of_the_whole_run_ends_it(photos: Path, tmp_path: Path, two_wor
 @needs_ray
 def test_ctrl_c_leaves_only_whole_files(photos: Path, tmp_path: Path) -> None:
     (photos / "x" / "a.png").write_bytes(b"wait")
-    command = [sys.executable, "-m", "tests.batch.toy_batch", str(photos), str(tmp_path / "out")]
-    process = subprocess.Popen(
-        command, env=ENVIRONMENT, start_new_session=True, stderr=subprocess.PIPE, text=True
-    )
+    process = started(photos, tmp_path / "out", 2, "local", start_new_session=True)
     wait_until((tmp_path / "victim").exists, process)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does
     error = process.communicate()[1].rstrip()
@@ -217,9 +214,6 @@ def test_a_lost_cluster_is_one_line_that_says_what_to_do(when: str, monkeypatch:
     class LocalRayletDiedError(RayError):
         pass
 
-    class Other(RayError):
-        pass
-
     def fail(*_: object, **__: object) -> None:
         raise LocalRayletDiedError("The node died. It had much more to say")
 
@@ -232,7 +226,7 @@ def test_a_lost_cluster_is_one_line_that_says_what_to_do(when: str, monkeypatch:
         cluster_resources=lambda: {"CPU": 1},
         wait=fail if when == "while it waits" else lambda running, **_: (running, []),
         get=fail,
-        exceptions=SimpleNamespace(**known, **dict.fromkeys(others, Other)),
+        exceptions=SimpleNamespace(**known, **dict.fromkeys(others, KeyError)),
         is_initialized=lambda: False,
     )
     monkeypatch.setattr("facerf_cli.run.ray_workers.connect", lambda *_: ray)

@@ -62,12 +62,12 @@ def write_envmaps(
         if not batch.dry_run:
             pixels, _ = draw_sky(index, seed, size_px, kinds)
             write_exr(path, pixels, metadata={**facts, "Software": f"facerf {__version__}"})
-            journal.own(path)
+            journal.add_file(path)
         print(path, flush=True)
     if is_shown_anew:
         if not batch.dry_run:
             write_sheet(list(maps), sheet)
-            journal.own(sheet)
+            journal.add_file(sheet)
             log.info("%s: shows %d of %d maps", sheet, min(count, MOST_MAPS), count)
         print(sheet, flush=True)
 
