@@ -10,8 +10,8 @@ import sys
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from contextlib import ExitStack, closing, suppress
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -139,7 +139,8 @@ def run_items(job: Job, items: Sequence[Item], options: BatchOptions, settings: 
             try:
                 stack.enter_context(alone_in(options.output, f".facerf-lock{options.shard.suffix}"))
             except OSError as error:
-                raise _unusable(options.output, error) from error
+                reason = f"cannot be written to ({error.strerror}); use another folder"
+                raise UsageError(f"-o {options.output}: {reason}") from error
         if (options.output / f".FACERF-LOCK{options.shard.suffix}").exists():  # case is ignored there
             check_case(path for paths in outputs.values() for path in paths)
         if options.report:
@@ -163,13 +164,6 @@ def run_items(job: Job, items: Sequence[Item], options: BatchOptions, settings: 
             if options.report:
                 write_report(options.output, journal.items)
     return int(lacks or failures > 0)
-
-
-def _unusable(folder: Path, error: BaseException) -> UsageError:
-    reason = error.strerror if isinstance(error, OSError) else error
-    if folder.is_symlink() and not folder.exists():
-        reason = "a link that leads nowhere"
-    return UsageError(f"-o {folder}: cannot be written to ({reason}); use another folder")
 
 
 class Plan(NamedTuple):
@@ -207,14 +201,7 @@ def _plan(job: Job, outputs: Outputs, options: BatchOptions, journal: Journal) -
 def _make(job: Job, plan: Plan, journal: Journal, options: BatchOptions, settings: Settings) -> int:
     """Make stale outputs, note and print how each item ended; return how many failed."""
     todo = [_to_make(item, plan, journal, options) for item, paths in plan.stale.items() if paths]
-    try:
-        journal.open([*todo, *(result.item for result in plan.rejected)])
-    except FacerfError as error:
-        raise _unusable(options.output, error.__cause__ or error) from error
-    if plan.keys and options.overwrite == "changed":
-        for item, stale in plan.stale.items():
-            kept = [path for path in plan.outputs[item] if path not in stale]
-            keep_newer(kept, files_read((item, job), [item]))
+    journal.open([*todo, *(result.item for result in plan.rejected)])
 
     def done(result: ItemResult) -> int:
         row, outputs = result.row(job.verb, options.output), plan.outputs[result.item]
@@ -238,15 +225,6 @@ def _to_make(item: Item, plan: Plan, journal: Journal, options: BatchOptions) ->
     others = journal.replaceable(item).difference(outputs) if plan.keys else set()
     key = journal.key_of(item, plan.keys[0]) if plan.keys and options.file else ""
     return replace(item, stale=frozenset({*stale, *others}), kept=frozenset(outputs) - set(stale), key=key)
-
-
-def keep_newer(outputs: Sequence[Path], read: Iterable[Path]) -> None:
-    """Touch finished outputs that are older than a file they were made from, as Make expects."""
-    with suppress(OSError):
-        newest_ns = max((path.stat().st_mtime_ns for path in read), default=0) if outputs else 0
-        for path in outputs:
-            if path.stat().st_mtime_ns < newest_ns:
-                os.utime(path)
 
 
 def _results(

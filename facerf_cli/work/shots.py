@@ -24,7 +24,6 @@ from facerf_cli.batch.inputs import (
 )
 from facerf_cli.batch.journal import Journal
 from facerf_cli.batch.recipe import DigestOf, Recipe, RecipesOf, key_of
-from facerf_cli.batch.run import keep_newer
 from facerf_cli.batch.settings import BatchOptions, folder_not_file
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.atomic import is_temporary
@@ -249,8 +248,6 @@ class VideoOutput:
         recipe = key_of({"video": recipes_of(journal.digest_of), "inputs": inputs, "rate": str(self.rate)})
         if not journal.to_make(items[0], [self.path], [recipe], batch.overwrite):
             log.info("%s: up to date", self.path)
-            if batch.overwrite == "changed" and not batch.dry_run:
-                keep_newer([self.path], [item.input_path for item in items])
             return ""
         if batch.dry_run:
             print(named(f"{items[0].input_path} -> {self.path}"))

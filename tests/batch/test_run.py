@@ -3,7 +3,6 @@
 import os
 import shutil
 import signal
-import time
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Never
@@ -325,21 +324,6 @@ def test_outputs_that_differ_only_in_case(tmp_path: Path, ignores: bool) -> None
         assert not list(out.glob("*.bin"))
     else:
         assert run(photos, out) == 0
-
-
-def test_finished_outputs_are_newer_than_their_input(two: Path, tmp_path: Path) -> None:
-    """Make compares times: an input that was touched would be made again for ever."""
-    out, touched = tmp_path / "out/a_copy.bin", two / "a.png"
-    run([two], tmp_path / "out")
-    before = (tmp_path / "out/b_copy.bin").stat().st_mtime_ns
-    later = time.time_ns() - 10**9
-    os.utime(out, ns=(later - 10**10, later - 10**10))
-    os.utime(touched, ns=(later, later))
-    run([two], tmp_path / "out", dry_run=True)
-    assert out.stat().st_mtime_ns < touched.stat().st_mtime_ns
-    run([two], tmp_path / "out")
-    assert out.stat().st_mtime_ns > touched.stat().st_mtime_ns and out.read_bytes() == b"a"
-    assert (tmp_path / "out/b_copy.bin").stat().st_mtime_ns == before
 
 
 def test_only_stale_outputs_are_made(two: Path, tmp_path: Path, capsys: Said) -> None:
