@@ -13,7 +13,7 @@ from facerf_cli.network.inputs import head_rotation
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.raster.texture import unwrap
 from facerf_cli.synth.bank.heads import Bank
-from facerf_cli.synth.bank.texture_samples import Sample, camera_matrix
+from facerf_cli.synth.bank.texture_samples import TEXTURE_CAMERA, Sample
 from facerf_cli.training.light_features import LightFeaturesObjective
 from facerf_cli.training.objective import seeded
 from facerf_cli.training.texture import HeadsSettings
@@ -92,7 +92,7 @@ def test_the_crops_of_a_stack_give_its_textures(tmp_path: Path) -> None:
 
 
 def test_cameras_cast_colours_and_turns_are_found_from_normals() -> None:
-    matrices = torch.stack([camera_matrix(seeded(draw)) for draw in range(400)])
+    matrices = torch.stack([TEXTURE_CAMERA.colours(seeded(draw)) for draw in range(400)])
     grey = matrices[:, 0, 1] > 0
     cast, mixed = matrices[~grey], matrices[grey]
     assert 0.2 < grey.float().mean() < 0.3
