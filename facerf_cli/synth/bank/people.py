@@ -69,9 +69,11 @@ class PeopleBankSettings:
     lights: int = 48
     side_px: int = SIDE_PX
     photo_px: int = PHOTO_PX
-    with_squares: bool = True  # without them the photos are the same
+    with_squares: bool = True
 
 
+# Photos show faces of about 100 pixels, for which coarse meshes and few lights suffice.
+PHOTO_BANK = PeopleBankSettings(lights=24, side_px=96, with_squares=False)
 TINY_BANK = PeopleBankSettings(cameras=1, squares=1, images=1, looks=1, lights=12, side_px=96, photo_px=128)
 
 
@@ -133,14 +135,15 @@ def _photo(
     view: BakedView, looks: list[Material], images: int, generator: torch.Generator
 ) -> dict[str, Tensor]:
     """Render the images of a photo, and its truth; see `bake_person`."""
-    stored = []
-    for number in range(images):
-        weights = draw_photo_light(view.directions, generator, _KEY_LIGHT)
-        (image,) = images_under(view, looks[number % len(looks)], weights[None])
-        mean = image.sum() / 3 / view.alpha.sum().clamp_min(1)
-        stored.append((255 * (image / (BRIGHTEST * mean.clamp_min(1e-6))).clamp(0, 1).sqrt()).round().byte())
+    weights = [draw_photo_light(view.directions, generator, _KEY_LIGHT) for _ in range(images)]
+    radiance = torch.empty(images, 3, *view.alpha.shape)
+    for first, look in enumerate(looks[:images]):
+        every = slice(first, None, len(looks))
+        radiance[every] = images_under(view, look, torch.stack(weights[every]))
+    mean = radiance.sum((1, 2, 3), keepdim=True) / 3 / view.alpha.sum().clamp_min(1)
+    relative = (radiance / (BRIGHTEST * mean.clamp_min(1e-6))).clamp(0, 1)
     return {
-        "images": torch.stack(stored),
+        "images": (255 * relative.sqrt()).round().byte(),
         "alpha": (255 * view.alpha).round().byte(),
         "label": 1 + view.classes[..., 1:].argmax(-1).byte(),
         "landmarks_px": view.landmarks_px,
