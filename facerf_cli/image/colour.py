@@ -362,7 +362,7 @@ def chosen_exposure_ev(
 
 
 def most_exposure_ev(rule: ExposureRule, strength: float) -> float:
-    """Return the largest exposure in EV under light of a total luminance (`light_weights.strengths`).
+    """Return the largest exposure in EV under light of a total luminance (`Light.strengths`).
 
     A face toward a light of strength 1 needs 0 EV for the brightness of its photo. Under `auto`, the limit
     keeps a face under rear light dark.

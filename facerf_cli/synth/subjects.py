@@ -38,7 +38,7 @@ class Subject:
     head_to_world: Tensor  # [3, 3]
     face_vertices: Tensor  # [GRID * GRID, 3] of the canonical mesh, head frame
     landmarks_world: np.ndarray  # [68, 3], m
-    more_landmarks_world: dict[str, list[float]]  # of `truth.more_landmarks`, m
+    more_landmarks_world: dict[str, list[float]]  # of `views.more_landmarks`, m
     traits: dict[str, Any]
     lenses: HeadMesh | None = None  # of glasses, in world space
 

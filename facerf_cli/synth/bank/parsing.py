@@ -1,6 +1,6 @@
 """Training crops for the Parsing Network: stored photos of synthetic people, altered for every sample.
 
-A stored photo (`portraits.py`) is mirrored or not, turned, scaled and shifted in the crop, over a background,
+A stored photo (`people.py`) is mirrored or not, turned, scaled and shifted in the crop, over a background,
 sometimes with another person in it or something in front of the face. A camera then degrades it. Wide
 variation lets training on synthetic people serve for real ones (Wood et al., *Fake it till you make it*,
 2021).
