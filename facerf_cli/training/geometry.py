@@ -18,7 +18,7 @@ from facerf_cli.face.topology import CONTOUR, OUTER_EYE_CORNERS
 from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometryNetworkSettings
 from facerf_cli.network.inputs import concatenate
 from facerf_cli.raster.camera import crop_camera, project
-from facerf_cli.synth.bank.face_crops import FaceCrops, RenderedFaces
+from facerf_cli.synth.bank.geometry_crops import GeometryCrops, GeometryPhotos
 from facerf_cli.training.build import Run
 from facerf_cli.training.objective import Objective, Validation
 from facerf_cli.training.sheets import FOUND_COLOUR, TRUE_COLOUR, in_rows, mark, tiled
@@ -49,7 +49,7 @@ class GeometryObjective(Objective):
 
     def __init__(
         self,
-        faces: RenderedFaces,
+        faces: GeometryPhotos,
         network: GeometryNetwork | None = None,
         settings: GeometryObjectiveSettings = GeometryObjectiveSettings(),
     ) -> None:
@@ -68,15 +68,15 @@ class GeometryObjective(Objective):
         self.register_buffer("identity_m", points[1][: own.identity])
         self.register_buffer("expression_m", points[2][: own.expression])
 
-    def draw_one(self, generator: torch.Generator) -> FaceCrops:
+    def draw_one(self, generator: torch.Generator) -> GeometryCrops:
         """Draw a crop of a random head."""
         head = int(self.heads[torch.randint(len(self.heads), (), generator=generator)])
         return self.faces.draw(head, self.side, generator)
 
-    def draw_held_out(self, person: int, generator: torch.Generator) -> FaceCrops:
+    def draw_held_out(self, person: int, generator: torch.Generator) -> GeometryCrops:
         return self.faces.draw(person, self.side, generator)
 
-    def forward(self, batch: FaceCrops) -> dict[str, Tensor]:
+    def forward(self, batch: GeometryCrops) -> dict[str, Tensor]:
         """Compute the weighted terms, each a mean over faces."""
         with self.mixed_precision():
             estimate = GeometryEstimate(*(x.float() for x in self.estimate(batch.crops)))
@@ -109,7 +109,7 @@ class GeometryObjective(Objective):
         in_camera = (self.mean_m + offset) @ estimate.rotation.mT + estimate.translation_m[:, None]
         return project(in_camera, crop_camera(side))
 
-    def distances_iod(self, estimate: GeometryEstimate, batch: FaceCrops) -> Tensor:
+    def distances_iod(self, estimate: GeometryEstimate, batch: GeometryCrops) -> Tensor:
         """Return distances [B, 68] to the true landmarks over the mean face's inter-ocular distance there.
 
         The eyes of a turned head are close together in the image; their distance would give it more weight.
@@ -141,7 +141,7 @@ class GeometryObjective(Objective):
         }
         return Validation(metrics, self._sheet(batch, estimate))
 
-    def _sheet(self, batch: FaceCrops, estimate: GeometryEstimate) -> np.ndarray:
+    def _sheet(self, batch: GeometryCrops, estimate: GeometryEstimate) -> np.ndarray:
         """Draw held-out crops with the true landmarks in green and the estimated ones in red."""
         side, count, size = batch.crops.shape[-1], _SHEET_ROWS * _SHEET_COLUMNS, _SHEET_PX
         images = nn.functional.interpolate(batch.crops[:count].cpu(), (size, size), mode="nearest")
@@ -157,7 +157,7 @@ def build(run: Run) -> Objective:
     """Make the objective of the stage; bake synthetic people that are missing."""
     held_out = run.sizes.held_out_heads
     folder, provenance = run.bake_people(held_out, with_squares=False)
-    faces = RenderedFaces(folder, run.backgrounds(run.bank), provenance)
+    faces = GeometryPhotos(folder, run.backgrounds(run.bank), provenance)
     settings = GeometryObjectiveSettings(held_out_heads=held_out)
     network = run.geometry(faces.mean_translation_m())
     objective: Objective = run.objective(GeometryObjective)(faces, network, settings)

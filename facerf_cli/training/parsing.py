@@ -17,7 +17,7 @@ from facerf_cli.image.colour import srgb_to_linear
 from facerf_cli.network.inputs import concatenate
 from facerf_cli.network.parsing import Parsing, ParsingNetwork
 from facerf_cli.portrait.parse import CLASSES
-from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
+from facerf_cli.synth.bank.parsing_crops import ParsingCrops, ParsingPhotos
 from facerf_cli.training.build import Run
 from facerf_cli.training.objective import Objective, Validation
 from facerf_cli.training.sheets import FOUND_COLOUR, TRUE_COLOUR, in_rows, mark, tiled
@@ -49,7 +49,7 @@ class ParsingObjective(Objective):
 
     def __init__(
         self,
-        portraits: StoredPortraits,
+        portraits: ParsingPhotos,
         network: ParsingNetwork | None = None,
         settings: ParsingObjectiveSettings = ParsingObjectiveSettings(),
     ) -> None:
@@ -62,14 +62,14 @@ class ParsingObjective(Objective):
         rarity = [settings.rare if name in _RARE else 1.0 for name in CLASSES]
         self.register_buffer("rarity", torch.tensor(rarity), persistent=False)
 
-    def draw_one(self, generator: torch.Generator) -> PortraitCrops:
+    def draw_one(self, generator: torch.Generator) -> ParsingCrops:
         """Draw a crop of a random person."""
         return self.portraits.draw(self.people, self.side, generator)
 
-    def draw_held_out(self, person: int, generator: torch.Generator) -> PortraitCrops:
+    def draw_held_out(self, person: int, generator: torch.Generator) -> ParsingCrops:
         return self.portraits.draw([person], self.side, generator)
 
-    def forward(self, batch: PortraitCrops) -> dict[str, Tensor]:
+    def forward(self, batch: ParsingCrops) -> dict[str, Tensor]:
         """Compute the weighted terms, each a mean over crops."""
         with self.mixed_precision():
             parsing: Parsing = self.network(batch.crops)
@@ -125,7 +125,7 @@ class ParsingObjective(Objective):
         metrics["total"] = 1 - metrics["mean_iou"] + metrics["landmarks_percent"] / 20
         return Validation(metrics, self._sheet(batch, parsing))
 
-    def _sheet(self, batch: PortraitCrops, parsing: Parsing) -> np.ndarray:
+    def _sheet(self, batch: ParsingCrops, parsing: Parsing) -> np.ndarray:
         """Draw held-out crops with true (green) and predicted (red) landmarks, and predicted classes."""
         palette = torch.from_numpy(np.random.default_rng(2).uniform(0.15, 1, (len(CLASSES), 3))).float()
         palette[0] = 0
@@ -144,7 +144,7 @@ def build(run: Run) -> Objective:
     """Make the objective of the stage; bake synthetic people that are missing."""
     held_out = run.sizes.held_out_heads
     folder, provenance = run.bake_people(held_out, with_squares=False)
-    stored = StoredPortraits(folder, run.backgrounds(run.bank), provenance)
+    stored = ParsingPhotos(folder, run.backgrounds(run.bank), provenance)
     settings = ParsingObjectiveSettings(held_out_people=held_out)
     objective: Objective = run.objective(ParsingObjective)(stored, run.network("parsing"), settings)
     return objective

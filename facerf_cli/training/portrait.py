@@ -21,7 +21,7 @@ from facerf_cli.synth.bank.portrait_samples import (
     SMALL,
     PortraitSample,
     PortraitSource,
-    StoredTransport,
+    PortraitSquares,
 )
 from facerf_cli.synth.bank.proxies import add_proxies
 from facerf_cli.training.build import Run
@@ -206,9 +206,9 @@ def build(run: Run) -> Objective:
     return objective
 
 
-def _stored_transport(run: Run, held_out: int) -> StoredTransport:
+def _stored_transport(run: Run, held_out: int) -> PortraitSquares:
     """Open the bank of synthetic people; bake and analyse those that are missing."""
     options, backgrounds = run.options, run.backgrounds(run.bank)
     folder, provenance = run.bake_people(held_out, with_squares=True)
     add_proxies(folder, backgrounds, run.people, options.jobs, options.settings.seed)
-    return StoredTransport(folder, backgrounds, provenance)
+    return PortraitSquares(folder, backgrounds, provenance)
