@@ -104,9 +104,7 @@ class PortraitSquares:
             if seen_path(path).exists() and seen_path(path).stat().st_size > _EMPTY_BYTES:
                 people.setdefault(path.stem.split("_")[0], {})[path] = _side_px(path)
         if not people:
-            raise InputError(
-                f"{folder}: no squares; bake people with `facerf train --stage portrait`"
-            )
+            raise InputError(f"{folder}: no squares; bake people with `facerf train --stage portrait`")
         self.views = list(people.values())
         self.backgrounds = backgrounds
         self.provenance = provenance
