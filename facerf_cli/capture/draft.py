@@ -87,8 +87,8 @@ def draft_stage(folder: Path, pattern: str) -> dict[str, Any]:
         raise UsageError(
             "--pattern: missing; name the parts of a path, such as '{subject}/{camera}/{light}.exr'"
         )
-    found = folder.glob(re.sub(f"{{({'|'.join(FIELDS)})}}", "*", glob.escape(pattern)))
-    images = (path.relative_to(folder).as_posix() for path in found if path.is_file())
+    matching = folder.glob(re.sub(f"{{({'|'.join(FIELDS)})}}", "*", glob.escape(pattern)))
+    images = (path.relative_to(folder).as_posix() for path in matching if path.is_file())
     frames = frames_by_pattern(images, pattern)
     lights, cameras = frames.ids("light"), frames.ids("camera")
     if len(lights) < _LEAST_LIGHTS:

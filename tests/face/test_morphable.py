@@ -90,3 +90,8 @@ def test_a_damaged_file_is_refused_in_one_line(at: float, model, tmp_path):
     data[start : start + 64] = b"\xff" * 64
     (tmp_path / "a.npz").write_bytes(data)
     refused(InputError, "not a facerf face model", load_face_model, tmp_path / "a.npz")
+
+
+def test_a_text_is_not_a_face_model(tmp_path: Path) -> None:
+    (tmp_path / "a.npz").write_text("hello")
+    refused(InputError, "not a zip file ... face-model import", load_face_model, tmp_path / "a.npz")
