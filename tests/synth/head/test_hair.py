@@ -33,10 +33,10 @@ def hairs(head: HeadMesh) -> Hairs:
 
 
 def grown(head: HeadMesh, name: str, seed: int = 5) -> tuple[HairStyle, HeadMesh]:
-    """Every fourth wisp of a style."""
+    """Every eighth wisp of a style."""
     random = np.random.default_rng(seed)
     style = draw_style(random, name)
-    style = replace(style, wisps=style.wisps // 4)
+    style = replace(style, wisps=style.wisps // 8)
     return style, grow_hair(head, style, random)
 
 
@@ -50,7 +50,7 @@ def test_every_style_is_a_sound_mesh_rooted_on_the_scalp_alone(
     hairs: Hairs, name: str, head: HeadMesh
 ) -> None:
     style, hair = hairs[name]
-    assert 12_500 < len(hair.vertices) <= 150_000 and len(hair.triangles) <= 150_000
+    assert 6_250 < len(hair.vertices) <= 150_000 and len(hair.triangles) <= 150_000
     assert hair.triangles.min() == 0 and hair.triangles.max() == len(hair.vertices) - 1
     assert (hair.part == PARTS.index("hair")).all()
     for field in (hair.vertices, hair.normals, hair.uv, hair.tangents):
