@@ -18,8 +18,8 @@ from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import pose_to_rotation, project
 from facerf_cli.raster.texture import vertex_normals
 from facerf_cli.synth.bank.heads import cached_face_model
+from facerf_cli.synth.person import SyntheticPerson, draw_person
 from facerf_cli.synth.renderer import bake_light, images_under, view_of
-from facerf_cli.synth.subjects import Subject, draw_subject
 from facerf_cli.synth.views import StageCamera, stage_cameras, surface_samples
 
 _NEAR = 4  # vertices of the face that carry a vertex of the mesh
@@ -30,10 +30,10 @@ _REACH_M = 0.012  # from the face, at which the mesh follows it by 1 / e
 class Actor:
     """A subject and the face model that moves it; expressions are added to the subject's own."""
 
-    subject: Subject
+    subject: SyntheticPerson
     model: MorphableModel
 
-    def with_expression(self, strengths: dict[str, float]) -> Subject:
+    def with_expression(self, strengths: dict[str, float]) -> SyntheticPerson:
         """Move the face by expression shapes, by name, in standard deviations; hair and clothes stay."""
         beta = torch.tensor([strengths.get(name, 0.0) for name in self.model.expression_names])
         moved_m = torch.einsum("k,kvc->vc", beta, self.model.expression)
@@ -169,7 +169,7 @@ def expression(time_s: float) -> dict[str, float]:
 class Posed:
     """A person in one frame, as its camera sees them."""
 
-    subject: Subject
+    subject: SyntheticPerson
     camera: StageCamera
 
     def shows(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -184,7 +184,7 @@ class Posed:
         return project(in_camera, self.camera.camera).numpy()
 
 
-def _points(subject: Subject, corners: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def _points(subject: SyntheticPerson, corners: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return np.asarray(np.einsum("pk,pkc->pc", weights, subject.mesh.vertices[corners]))
 
 
@@ -195,7 +195,7 @@ def posed(actor: Actor, frame: int, size_px: int) -> Posed:
     return Posed(actor.with_expression(expression(frame / RATE)), camera)
 
 
-def motion_of(frames: list[Posed], rest: Subject) -> dict[str, np.ndarray]:
+def motion_of(frames: list[Posed], rest: SyntheticPerson) -> dict[str, np.ndarray]:
     """Place and flows of a clip, by their names in `Clip`."""
     size = frames[0].camera.camera.width_px
     middle, found = frames[len(frames) // 2], {}
@@ -220,7 +220,7 @@ def motion_of(frames: list[Posed], rest: Subject) -> dict[str, np.ndarray]:
 def draw_clip(person: int, frames: int, size_px: int) -> Clip:
     """Photograph a person who talks and turns; lights are fixed to the camera."""
     model = cached_face_model("builtin")
-    actor = Actor(draw_subject(model, person, SEED, size_px), model)
+    actor = Actor(draw_person(model, person, SEED, size_px), model)
     people = [posed(actor, frame, size_px) for frame in range(frames)]
     images, alphas = [], []
     for one in people:

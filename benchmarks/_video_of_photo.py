@@ -1,5 +1,6 @@
 """Frames of a video; of a photo, those of a camera that pans and zooms by less than a pixel a frame."""
 
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +21,7 @@ def frames_of(path: Path, count: int) -> list[np.ndarray]:
     if path.suffix.lower() in VIDEO_SUFFIXES:
         from facerf_cli.files.video import Video
 
-        video = Video(path)
-        coded = [video.read(n) for n in range(min(count, len(video.timing.times_s)))]
+        coded = islice(Video(path).frames(), count)
         return [np.asarray(srgb_to_linear(x[..., :3] / np.iinfo(x.dtype).max), np.float32) for x in coded]
     photo = read_image(path).pixels
     photo = resized(photo, *fitted(*photo.shape[:2], SIDE_PX)) if max(photo.shape[:2]) > SIDE_PX else photo

@@ -30,7 +30,7 @@ from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import crop_camera
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, load_models
-from facerf_cli.synth.bank.face_crops import RenderedFaces
+from facerf_cli.synth.bank.geometry_crops import GeometryPhotos
 from facerf_cli.training.geometry import GeometryObjective, GeometryObjectiveSettings
 from facerf_cli.training.joint import LANDMARKS, chosen, pose_heads
 
@@ -98,7 +98,7 @@ def held_out(network: GeometryNetwork, folder: Path, count: int, draws: int) -> 
     """Print the errors on held-out heads of a bank; their crops, and their landmarks with noise."""
     settings = GeometryObjectiveSettings(held_out_people=count, held_out_draws=draws)
     backgrounds = load_file(folder.parent / "backgrounds.safetensors")["backgrounds"]
-    objective = GeometryObjective(RenderedFaces(folder, backgrounds, {}), network, settings)
+    objective = GeometryObjective(GeometryPhotos(folder, backgrounds, {}), network, settings)
     metrics = objective.validate().metrics
     print(
         "held-out heads, true landmarks:", ", ".join(f"{key} {value:.2f}" for key, value in metrics.items())

@@ -44,7 +44,7 @@ from facerf_cli.portrait.segment import segment
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth.bank.backgrounds import heaps_of, views_of_map
-from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
+from facerf_cli.synth.bank.parsing_crops import ParsingCrops, ParsingPhotos
 from facerf_cli.training.objective import seeded
 
 SEED = 7
@@ -217,13 +217,13 @@ def measure_regions(folder: Path, regions: dict[str, dict[str, list[list[list[fl
                 print(f"{subject} {name}: {got[name]:.3f} (matte {matte:.3f}; {others})")
 
 
-def _held_out(folder: Path) -> StoredPortraits:
+def _held_out(folder: Path) -> ParsingPhotos:
     """The people of a bank, before backgrounds that no training drew."""
     backgrounds = torch.cat([*(views_of_map(index, SEED) for index in range(8)), heaps_of(32, SEED)])
-    return StoredPortraits(folder, backgrounds, {})
+    return ParsingPhotos(folder, backgrounds, {})
 
 
-def _matte_errors(found: np.ndarray, crop: PortraitCrops) -> tuple[float, float]:
+def _matte_errors(found: np.ndarray, crop: ParsingCrops) -> tuple[float, float]:
     """Sum of absolute differences and gradient error of a matte [S, S], in thousands."""
     matte, alpha = (x * crop.weight[0].numpy() for x in (found, crop.alpha[0].numpy()))
     slopes = [gaussian_gradient_magnitude(x, 1.4) for x in (matte, alpha)]

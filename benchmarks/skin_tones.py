@@ -2,7 +2,7 @@
 
     python benchmarks/skin_tones.py --bank DIR [--drawn 24]
 
-One person of a bank of portraits (`facerf train --stage portrait`) in six appearances, from the darkest to
+One person of a bank of people (`facerf train --stage portrait`) in six appearances, from the darkest to
 the lightest skin of those that are drawn, is photographed in one natural light by one exposure, and relit
 to a lamp at the side and to another natural light. Printed: the true albedo of the skin, and the mean
 luminance of the face and that which a tenth of it exceeds, in the photo and as shown by `--exposure auto`
@@ -43,11 +43,11 @@ def main() -> None:
     parser.add_argument("--bank", type=Path)
     parser.add_argument("--drawn", type=int, default=24)
     options = parser.parse_args()
-    bank = required(options.bank, "a bank of portraits", "--bank")
+    bank = required(options.bank, "a bank of people", "--bank")
     view = load_view(min((bank / "people").glob("[0-9]*_0.safetensors")))
     models = load_models()
     looks = [
-        materials_of(view.portrait, draw_appearance(LOOK_PX, seeded(SEED, number)))
+        materials_of(view.baked, draw_appearance(LOOK_PX, seeded(SEED, number)))
         for number in range(options.drawn)
     ]
     looks.sort(key=lambda look: albedo_of_skin(view, look))
@@ -69,12 +69,12 @@ def main() -> None:
 
 def skin_of(view: StoredView) -> np.ndarray:
     """True where the person's skin is seen [S, S]."""
-    return np.asarray(view.portrait.classes.numpy()[..., class_index("skin")] > 0.5)
+    return np.asarray(view.baked.classes.numpy()[..., class_index("skin")] > 0.5)
 
 
 def albedo_of_skin(view: StoredView, look: Material) -> float:
     """Mean luminance of the skin's true albedo."""
-    albedo = albedo_of(view.portrait, look)[0].permute(1, 2, 0).numpy()
+    albedo = albedo_of(view.baked, look)[0].permute(1, 2, 0).numpy()
     return float(luminance(albedo)[skin_of(view)].mean())
 
 
@@ -82,12 +82,12 @@ def measured(
     models: Models, view: StoredView, look: Material
 ) -> tuple[float, np.ndarray, dict[str, np.ndarray]]:
     """Albedo of the skin, and the face's luminances in the photo and as shown."""
-    rig, skin = view.portrait.directions, skin_of(view)
+    rig, skin = view.baked.directions, skin_of(view)
     natural = torch.stack([draw_light(rig, seeded(SEED, number)) for number in range(2)])
     lamp = torch.zeros_like(natural[:1])
     lamp[0, (rig @ azel_to_direction(*torch.tensor(LAMP_AZEL_DEG)).float()).argmax()] = 1
-    source = images_under(view.portrait, look, natural[:1])[0]
-    wall = MEAN_RADIANCE / 2 * (1 - view.portrait.alpha)
+    source = images_under(view.baked, look, natural[:1])[0]
+    wall = MEAN_RADIANCE / 2 * (1 - view.baked.alpha)
     gain = GAIN / float(natural[0].sum(0).mean())
     photo = (gain * source + wall).permute(1, 2, 0).clamp(0, 1).numpy()
     person = fit(

@@ -33,8 +33,8 @@ from facerf_cli.raster.texture import unwrap
 from facerf_cli.synth.appearance.materials import Appearance, draw_appearance
 from facerf_cli.synth.head.mesh import HeadMesh
 from facerf_cli.synth.head.shell import shell_head
+from facerf_cli.synth.person import SyntheticPerson
 from facerf_cli.synth.renderer import images_under, light_of, view_of
-from facerf_cli.synth.subjects import Subject
 from facerf_cli.synth.views import StageCamera
 
 DISTANCE_M, FIELD_M = 1.5, 0.24  # of the cameras, and the width that an image shows
@@ -135,7 +135,9 @@ def render_both(
     transport = bake_mesh(head.vertices, head.normals, head.triangles, directions, bake, seed, wanted)
     flat = {name: replace(part, relief=0 * part.relief) for name, part in appearance.materials.items()}
     person = Appearance(flat, torch.zeros(3), {})
-    subject = Subject(head, person, torch.eye(3), torch.zeros(GRID * GRID, 3), np.zeros((68, 3)), {}, {})
+    subject = SyntheticPerson(
+        head, person, torch.eye(3), torch.zeros(GRID * GRID, 3), np.zeros((68, 3)), {}, {}
+    )
     light = light_of(subject, transport)
     times["bake"].append(time.perf_counter() - started)
     ours, theirs, single = [], [], torch.eye(len(directions))[..., None].expand(-1, -1, 3)

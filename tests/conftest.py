@@ -33,7 +33,7 @@ portrait/test_person.py cli/test_original.py relighting/test_portrait_field.py
 cli/test_relight_dataset.py cli/test_segment.py training/test_loop.py relighting/test_reflectance.py
 relighting/test_near_lights.py test_python_api.py cli/test_ambient.py relighting/test_white.py
 cli/test_evaluate_yale_b.py relighting/test_photo_light.py cli/test_prepare_checks.py
-portrait/test_find.py run/test_stopping.py test_notebook.py tools/test_builtin_face.py
+portrait/test_find.py run/test_stopping.py test_notebook.py tools/test_assets.py
 cli/test_shards_sum_up.py test_foreign_modules.py test_distribution.py benchmarks/test_path_tracer.py
 synth/head/test_hair.py
 """

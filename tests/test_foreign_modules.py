@@ -1,6 +1,5 @@
 """Modules that lie in the working directory, perhaps somebody else's, are never imported."""
 
-import importlib.util
 import os
 import re
 import subprocess
@@ -50,23 +49,9 @@ def test_a_reader_in_its_own_process_imports_none(folder: Path) -> None:
     assert not imported(folder)
 
 
-@pytest.mark.parametrize(
-    "workers",
-    [
-        ("--jobs", "2"),
-        pytest.param(
-            ("--ray", "local"),
-            marks=[
-                pytest.mark.slow,
-                pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="ray is not installed"),
-            ],
-        ),
-    ],
-    ids=" ".join,
-)
-def test_workers_import_none(folder: Path, workers: tuple[str, str], tmp_path_factory: Folders) -> None:
+def test_workers_import_none(folder: Path, tmp_path_factory: Folders) -> None:
     script = tmp_path_factory.mktemp("bin") / "facerf"
-    ended = run(script, "segment", "a.png", "b.png", "-o", "out", *workers)
+    ended = run(script, "segment", "a.png", "b.png", "-o", "out", "--jobs", "2")
     assert ended.returncode == 1 and ended.stderr.count("a.png") and ended.stderr.count("b.png"), ended.stderr
     assert not imported(folder)
 

@@ -62,17 +62,3 @@ def test_rooms_have_levels_whose_imports_point_down_without_circles(graph: Graph
         TopologicalSorter(graph).prepare()
     except CycleError as error:
         pytest.fail(" -> ".join(str(path.relative_to(PACKAGE)) for path in error.args[1]))
-
-
-def test_the_rules_catch_what_they_should() -> None:
-    face, network, files = (PACKAGE / name for name in ("face/a.py", "network/b.py", "files/c.py"))
-    assert complaints({files: {face}}) and complaints({network: {face}})
-    assert not complaints({face: {files}, files: {files}})
-
-
-def test_imports_are_found_wherever_they_stand(tmp_path: Path) -> None:
-    source = tmp_path / "a.py"
-    source.write_text(
-        "import torch\ndef f():\n    from facerf_cli.main import app\n    from facerf_cli import errors\n"
-    )
-    assert [path.stem for path in imported(source)] == ["main", "errors"]

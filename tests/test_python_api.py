@@ -15,7 +15,6 @@ import torch
 import facerf_cli as facerf
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.face.crop import from_landmarks
-from facerf_cli.files.read import read_image
 from facerf_cli.main import main
 from facerf_cli.portrait.confidence import SCALES
 from tests import astronaut
@@ -102,53 +101,6 @@ def test_a_group_is_of_one_photo(person: facerf.Person) -> None:
 
 
 @pytest.mark.slow
-def test_a_group_is_relit_as_on_the_command_line(tmp_path: Path) -> None:
-    """Two people: the same calls give the same image, its alpha and its layers."""
-    one = astronaut.photo()
-    both = np.hstack([one, np.full_like(one[:, :100], 0.2), one[:, ::-1]])
-    facerf.write_image(tmp_path / "both.exr", both)
-    line = ["relight", str(tmp_path / "both.exr"), "--face", "all", "--light", "60,30", "--ambient", "none"]
-    line += ["--background", "none", "--aov", "depth", "--exposure", "0", "-o", str(tmp_path / "out")]
-    assert main([*line, "--reflectance", "field"]) == 0
-    (written,) = (tmp_path / "out").glob("*.exr")
-    image = read_image(written)
-    photo = facerf.read_image(tmp_path / "both.exr")
-    faces = facerf.find_faces(astronaut.models(), photo)
-    assert [round(face.box_px[0] / photo.shape[1]) for face in faces] == [0, 1]
-    people = [facerf.fit(astronaut.models(), photo, face=face, reflectance="field") for face in faces]
-    group = facerf.Group(people)
-    found = group.relight(KEY, background="none", layers=["depth"])
-    assert image.alpha is not None
-    np.testing.assert_allclose(found["image"][..., 3], image.alpha, atol=1e-3)  # half floats
-    np.testing.assert_allclose(group.matte, found["image"][..., 3])
-    shown = found["image"][..., :3] * found["image"][..., 3:]
-    np.testing.assert_allclose(shown, image.pixels * image.alpha[..., None], atol=2e-3)
-    assert set(found) == {"image", "person.A", "depth"} and found["depth"].any()
-
-
-@pytest.mark.slow
-def test_a_map_is_behind_as_on_the_command_line(page: dict[str, Any], tmp_path: Path) -> None:
-    sun = ROOT / "examples/maps/low_sun.exr"
-    line = [
-        "relight",
-        str(PHOTO),
-        "--envmap",
-        str(sun),
-        "--rotate",
-        "40",
-        "--lights",
-        "24",
-        "--exposure",
-        "0",
-    ]
-    assert main([*line, "--background", "envmap", "--background-blur", "0", "-o", str(tmp_path)]) == 0
-    (written,) = tmp_path.glob("*.exr")
-    light = facerf.Light.from_envmap(page["envmap"], rotate_deg=40, lights=24)
-    relit = page["person"].relight(light, background=page["person"].backdrop(page["envmap"], rotate_deg=40))
-    np.testing.assert_allclose(facerf.read_image(written), relit, rtol=2e-3, atol=1e-4)
-
-
-@pytest.mark.slow
 def test_lights_add_up_and_a_white_map_of_one_gives_the_face_its_brightness(page: dict[str, Any]) -> None:
     one, rim = page["person"], facerf.Light.single(-70, 0, (1, 0.1, 0.1))
     first, second, both = one.relight([KEY, rim, sum([KEY, 2 * rim])], background="none")
@@ -173,23 +125,6 @@ def test_lights_add_up_and_a_white_map_of_one_gives_the_face_its_brightness(page
     inner = slice(17, 68)  # the contour's landmarks slide
     size_px = from_landmarks(one.landmarks, 1).side_px
     assert np.linalg.norm(shown[inner] - one.landmarks[inner], axis=1).mean() < 0.02 * size_px
-
-
-@pytest.mark.slow
-def test_a_light_costs_what_a_light_costs(page: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    """What does not depend on the light is made once, whatever the lights."""
-    one = page["person"]
-    one.relight(KEY)
-
-    def made_again(*given: object, **more: object) -> None:
-        raise AssertionError("made again")
-
-    for name in ("FaceAlone", "PersonInPhoto"):
-        monkeypatch.setattr(f"facerf_cli.person.{name}", made_again)
-    monkeypatch.setattr("facerf_cli.person.reflectance_of", made_again)
-    assert np.isfinite(one.relight(facerf.Light.single(20, 0))).all()
-    with pytest.raises(AssertionError, match="made again"):
-        one.relight(KEY, pose=(10, 0, 0))
 
 
 def test_a_given_matte_says_who_is_relit() -> None:

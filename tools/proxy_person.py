@@ -39,7 +39,7 @@ _JAW_M, _TEMPLE_M = (-0.075, -0.03), (0.03, 0.07)  # and from the jaw up to the 
 
 
 def proxy_tensors() -> dict[str, torch.Tensor]:
-    """Build the person: see `portrait.proxy._Person`."""
+    """Build the person: see `portrait.proxy._MeanPerson`."""
     model = load_face_model(BUILTIN)
     face = model.vertices(torch.zeros(1, len(model.identity)), torch.zeros(1, len(model.expression)))[0]
     head = shell_head(face, (0.0, 0.0), 0)

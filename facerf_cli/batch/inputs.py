@@ -47,28 +47,12 @@ _DIGITS = re.compile(r"(\d+)")
 _MOST_FRAMES = 100_000
 _MOST_NAMED = 8  # suffixes or folders in a log line
 _LONGEST_PATH = 4096  # characters
-_START_BYTES, _QUOTED_BYTES = 4096, 40  # of standard input: searched for an image, and quoted in a message
+_START_BYTES, _QUOTED_BYTES = 4096, 40  # of standard input: searched for names, and quoted in a message
 _LEAST_EXISTING = 0.1  # fraction of a list's names; other data may contain the folders . and /
 _MOST_LIST_BYTES = 64 << 20  # on standard input
 _MOST_IMAGE_BYTES = 1 << 30  # on standard input: the most pixels that are read, of four floats
-_STARTS = {  # the first bytes of images, by suffix
-    ".exr": rb"\x76\x2f\x31\x01",
-    ".hdr": rb"#\?(RADIANCE|RGBE)",
-    ".png": rb"\x89PNG",
-    ".jpg": rb"\xff\xd8\xff",
-    ".tif": rb"II[*+]\0|MM\0[*+]",
-    ".webp": rb"RIFF.{4}WEBP",
-    ".jxl": rb"\xff\x0a|\0\0\0\x0cJXL ",
-    ".heic": rb".{4}ftyp(hei[cmsx]|hevc|mif1|msf1)",
-    ".avif": rb".{4}ftypavi[fs]",
-    ".jp2": rb"\0\0\0\x0cjP  |\xff\x4f\xff\x51",
-    ".psd": rb"8BPS\0",
-    ".bmp": rb"BM.{4}\0{4}",
-    ".gif": rb"GIF8[79]a",
-    ".dpx": rb"SDPX\0\0|XPDS..\0\0",
-    ".cin": rb"\x80\x2a\x5f\xd7|\xd7\x5f\x2a\x80",
-    ".ppm": rb"P[2356Ff](\s+(#[^\n]*\n\s*)*-?[\d.]+){3}\s",
-}
+_IMAGE = re.compile(rb"P[1-7Ff]\s|.*?[\x01-\x08\x0b\x0c\x0e-\x1f]", re.DOTALL)  # or other binary data
+_EXR = b"\x76\x2f\x31\x01"
 
 log = logging.getLogger(LOGGER_NAME)
 
@@ -254,31 +238,15 @@ def _as_frames(files: Sequence[tuple[Path, PurePosixPath]]) -> Iterator[tuple[Pa
             yield path, mirrored.with_name(f"{stem}.{parts[at]}{mirrored.suffix}")
 
 
-def check_case(outputs: Sequence[Path], folder: Path) -> None:
-    """Raise UsageError for outputs that are one file if the file system ignores case; else warn."""
+def check_case(outputs: Iterable[Path]) -> None:
+    """Raise UsageError for outputs that are one file where the file system ignores case."""
     by_name: dict[str, Path] = {}
     for path in outputs:
-        other = by_name.setdefault(unicodedata.normalize("NFC", str(path)).casefold(), path)
-        if other != path:
-            break
-    else:
-        return
-    if _ignores_case(folder):
-        raise UsageError(
-            f"{other} and {path}: would be one file, since the file system ignores case; rename one input, "
-            "or pass --name"
-        )
-    log.warning("%s and %s: differ only in case; on macOS and Windows they would be one file", other, path)
-
-
-def _ignores_case(folder: Path) -> bool:
-    """Tell whether the file system of a folder ignores case, from a name in it or in the nearest parent."""
-    absolute = folder.absolute()
-    here = next(path for path in (absolute, *absolute.parents) if path.is_dir())
-    for name in os.listdir(here):
-        if (other := name.swapcase()) != name:
-            return os.path.exists(here / other) and os.path.samefile(here / name, here / other)
-    return False
+        if (other := by_name.setdefault(str(path).casefold(), path)) != path:
+            raise UsageError(
+                f"{other} and {path}: would be one file, since the file system ignores case; rename one "
+                "input, or pass --name"
+            )
 
 
 def only_item(items: Sequence[Item], output: Path, several: bool) -> Item:
@@ -381,40 +349,43 @@ def numbered_images(text: str, output: Path) -> tuple[Path, ...]:
 
 
 def _from_stdin(null_separated: bool) -> list[str]:
-    """List the names on standard input; or copy an image from there to a temporary file.
+    """List the names on standard input, if some of the first exist; or copy an image to a temporary file.
 
-    The first bytes decide. Raises UsageError for other data, such as a video.
+    Readers recognise the image by its content. Raises UsageError for other text.
     """
     import tempfile  # --help does without it
 
+    def names_in(data: bytes) -> list[str]:
+        text = os.fsdecode(data).removeprefix("\ufeff")
+        names = text.split("\0") if null_separated else [line.rstrip("\r") for line in text.split("\n")]
+        return list(filter(None, names))
+
     stream = sys.stdin.buffer
     content = stream.read(_MOST_LIST_BYTES + 1)
-    for suffix, start in _STARTS.items():
-        if re.match(start, content[:_START_BYTES], re.DOTALL):
-            folder = tempfile.mkdtemp(prefix="facerf-stdin-")
-            remove = partial(shutil.rmtree, folder, ignore_errors=True)
-            atexit.register(remove)
-            clean_by(remove)
-            path = Path(folder, "stdin", f"stdin{suffix}")  # {parent} is stdin
-            path.parent.mkdir()
-            with path.open("wb") as file:
-                while content:
-                    file.write(content)
-                    if file.tell() > _MOST_IMAGE_BYTES:
-                        raise UsageError("-: an image of more than 1 GiB; pass the file by its name")
-                    content = stream.read(_MOST_LIST_BYTES)
-            return [str(path)]
-    is_utf16 = re.match(rb"\xff\xfe.\0|\xfe\xff\0.", content, re.DOTALL)
-    is_text = len(content) <= _MOST_LIST_BYTES and not is_utf16 and (null_separated or b"\0" not in content)
-    text = os.fsdecode(content).removeprefix("\ufeff") if is_text else "\0"
-    names = text.split("\0") if null_separated else [line.rstrip("\r") for line in text.split("\n")]
-    names = list(filter(None, names))
-    if not is_text or sum(map(os.path.lexists, names)) < _LEAST_EXISTING * len(names):
+    first = names_in(content[:_START_BYTES])
+    is_utf16 = content.startswith((b"\xff\xfe", b"\xfe\xff"))
+    is_list = not is_utf16 and sum(map(os.path.lexists, first)) >= _LEAST_EXISTING * len(first)
+    if is_list and len(content) <= _MOST_LIST_BYTES:
+        return names_in(content)
+    if is_list or not _IMAGE.match(content):
         raise UsageError(
             "-: standard input is neither an image nor a list of existing files in UTF-8 (it begins with "
             f"{content[:_QUOTED_BYTES]!r}); pass videos by name, and names that end in NUL with -0"
         )
-    return names
+    folder = tempfile.mkdtemp(prefix="facerf-stdin-")
+    remove = partial(shutil.rmtree, folder, ignore_errors=True)
+    atexit.register(remove)
+    clean_by(remove)
+    # The fields {parent} and {stem} are stdin. OLAT stacks are recognised by their suffix.
+    path = Path(folder, "stdin", "stdin.exr" if content.startswith(_EXR) else "stdin")
+    path.parent.mkdir()
+    with path.open("wb") as file:
+        while content:
+            file.write(content)
+            if file.tell() > _MOST_IMAGE_BYTES:
+                raise UsageError("-: an image of more than 1 GiB; pass the file by its name")
+            content = stream.read(_MOST_LIST_BYTES)
+    return [str(path)]
 
 
 def _range(entry: str, before: str, first: str, last: str, after: str) -> list[str]:

@@ -200,32 +200,31 @@ class Journal:
             item: The item.
             row: How it ended.
             made: Rows of its files; None after a failure.
-            outputs: Its results that have a key, in the order of the keys.
-            keys: Digests of recipes.
+            outputs: Its results, in the order of the keys.
+            keys: Digests of recipes; a single one is the key of all files that were written.
         """
         rows = [row]
         if made:
             recipes = {self._name(path): key for path, key in _with_keys(outputs, keys)}
             rows += [file for file in (made.read, *made.outputs) if file]
             for written in made.outputs:
-                recipe = recipes.get(self._name(Path(written["file"])), "")
+                recipe = recipes.get(self._name(Path(written["file"])), keys[0] if len(keys) == 1 else "")
                 key = _key(recipe, made.read.get("sha256", "none"))
-                rows.append(self._output_row(written, key) | {"item": item.name})
+                rows.append(self._output_row(written, key, item.name))
         self._append(rows)
 
-    def add_file(self, item: Item, output: Path, recipe: str) -> None:
-        """Add the single output of a run without items, with the digest of its recipe."""
-        read, written = file_row(item.input_path), file_row(output)
-        row = self._output_row(written, _key(recipe, read["sha256"])) | {"item": item.name}
-        self._append([read, written, row])
+    def add_file(self, path: Path, item: Item | None = None, recipe: str = "") -> None:
+        """Add a file that no work on an item has written, such as a video or the list of all pages.
 
-    def own(self, path: Path) -> None:
-        """Note a file that belongs to no item, such as the list of all pages, as written by facerf."""
-        self._append([self._output_row(file_row(path), "")])
+        If it is the only output of an item, `recipe` is the digest of its recipe.
+        """
+        rows = [file_row(path), *([file_row(item.input_path)] if item else [])]
+        key = _key(recipe, rows[-1]["sha256"]) if item else ""
+        self._append([*rows, self._output_row(rows[0], key, item.name if item else "")])
 
-    def _output_row(self, written: Row, key: str) -> Row:
+    def _output_row(self, written: Row, key: str, item: str) -> Row:
         name = self._name(Path(written["file"]))
-        return {"output": name, "verb": self._verb, "sha256": written["sha256"], "key": key}
+        return {"output": name, "verb": self._verb, "item": item, "sha256": written["sha256"], "key": key}
 
     def _append(self, rows: Iterable[Row]) -> None:
         rows = list(rows)
@@ -268,7 +267,7 @@ class Writes:
         left: Files that were left as they are.
     """
 
-    def __init__(self, item: Item, folder: Path, verb: str, journal: Path, overwrite: Overwrite) -> None:
+    def __init__(self, folder: Path, verb: str, journal: Path, overwrite: Overwrite, item: Item) -> None:
         self.left: set[Path] = set()
         self._written: dict[Path, tuple[str, Row]] = {}  # SHA-256 and state
         self._item, self._folder, self._journal, self._overwrite = item, folder, journal, overwrite

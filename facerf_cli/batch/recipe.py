@@ -79,20 +79,3 @@ def require_same(before: Recipe, now: Recipe, what: str, advice: str) -> None:
     names = sorted(name for name in before.keys() | now.keys() if before.get(name) != now.get(name))
     if names:
         raise UsageError(f"{what}: other {', '.join(names).replace('_', ' ')}; {advice}")
-
-
-def text_of_state(path: Path) -> str:
-    """Return text that changes when a file is rewritten."""
-    state = path.stat()
-    return f"{state.st_size}-{state.st_mtime_ns}"
-
-
-def is_made_from(path: Path, text: str) -> bool:
-    """Tell whether a safetensors file exists whose metadata `of` is the text."""
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(path, framework="np") as file:
-            return bool((file.metadata() or {}).get("of") == text)
-    except (SafetensorError, OSError):
-        return False

@@ -10,8 +10,8 @@ import sys
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, suppress
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 from facerf_cli.batch.inputs import Item, check_case, files_read, refuse_read
 from facerf_cli.batch.journal import Journal, Made, Row, Writes, file_row, item_of, json_rows, lines_of
 from facerf_cli.batch.recipe import DigestOf, Recipe, key_of
-from facerf_cli.batch.settings import BatchOptions, Overwrite, Settings, default_job_count
+from facerf_cli.batch.settings import BatchOptions, Settings, default_job_count
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import all_or_none, alone_in, asking, atomic_path, sweep_leftovers
 from facerf_cli.files.texts import regular_size, require_regular
@@ -32,7 +32,7 @@ from facerf_cli.run.workers import process_died, spread
 
 REPORT_NAME = "report.jsonl"
 Outputs = Mapping[Item, Sequence[Path]]
-Owner = tuple[Path, str, Path, Overwrite]  # output folder, command, its journal, --overwrite
+WritesOf = Callable[[Item], Writes]
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -112,23 +112,18 @@ class ItemResult:
         return {**row, **outcome.facts, **row}
 
 
-def write_report(folder: Path, rows: Iterable[Row]) -> None:
-    """Write rows of items to report.jsonl, after its rows of other items."""
-    table = _report_rows(folder)
-    for row in rows:
-        table.pop((row["verb"], row["item"]), None)
-        table[row["verb"], row["item"]] = row
-    with atomic_path(folder / REPORT_NAME) as temporary:
-        temporary.write_text(lines_of(table.values()), encoding="utf-8")
+def write_report(folder: Path, rows: Mapping[tuple[str, str], Row] | None = None) -> None:
+    """Write rows of items, by command and item, and those of other items in report.jsonl to that file.
 
-
-def _report_rows(folder: Path) -> dict[tuple[str, str], Row]:
-    """Read the rows of report.jsonl; UsageError if the file was not written by facerf."""
+    Without rows only check that facerf wrote it: else raise UsageError.
+    """
     path = folder / REPORT_NAME
-    table = {names: row for row in json_rows(path) if (names := item_of(row))}
-    if not table and regular_size(path):
+    earlier = {names: row for row in json_rows(path) if (names := item_of(row))}
+    if not earlier and regular_size(path):
         raise UsageError(f"{path}: was not written by facerf; move it, or choose another -o")
-    return table
+    if rows:
+        with atomic_path(path) as temporary:
+            temporary.write_text(lines_of((earlier | {**rows}).values()), encoding="utf-8")
 
 
 def run_items(job: Job, items: Sequence[Item], options: BatchOptions, settings: Settings) -> int:
@@ -144,10 +139,12 @@ def run_items(job: Job, items: Sequence[Item], options: BatchOptions, settings: 
             try:
                 stack.enter_context(alone_in(options.output, f".facerf-lock{options.shard.suffix}"))
             except OSError as error:
-                raise _unusable(options.output, error) from error
-        check_case([path for paths in outputs.values() for path in paths], options.output)
+                reason = f"cannot be written to ({error.strerror}); use another folder"
+                raise UsageError(f"-o {options.output}: {reason}") from error
+        if (options.output / f".FACERF-LOCK{options.shard.suffix}").exists():  # case is ignored there
+            check_case(path for paths in outputs.values() for path in paths)
         if options.report:
-            _report_rows(options.output)
+            write_report(options.output)
         journal = Journal(options.output, job.verb, options.shard, options.file)
         plan = _plan(job, {item: outputs[item] for item in items}, options, journal)
         lacks = False
@@ -165,15 +162,8 @@ def run_items(job: Job, items: Sequence[Item], options: BatchOptions, settings: 
         else:
             failures = _make(job, plan, journal, options, settings)
             if options.report:
-                write_report(options.output, _rows_of(job, plan, journal))
+                write_report(options.output, journal.items)
     return int(lacks or failures > 0)
-
-
-def _unusable(folder: Path, error: BaseException) -> UsageError:
-    reason = error.strerror if isinstance(error, OSError) else error
-    if folder.is_symlink() and not folder.exists():
-        reason = "a link that leads nowhere"
-    return UsageError(f"-o {folder}: cannot be written to ({reason}); use another folder")
 
 
 class Plan(NamedTuple):
@@ -211,24 +201,18 @@ def _plan(job: Job, outputs: Outputs, options: BatchOptions, journal: Journal) -
 def _make(job: Job, plan: Plan, journal: Journal, options: BatchOptions, settings: Settings) -> int:
     """Make stale outputs, note and print how each item ended; return how many failed."""
     todo = [_to_make(item, plan, journal, options) for item, paths in plan.stale.items() if paths]
-    try:
-        journal.open([*todo, *(result.item for result in plan.rejected)])
-    except FacerfError as error:
-        raise _unusable(options.output, error.__cause__ or error) from error
-    if plan.keys and options.overwrite == "changed":
-        for item, stale in plan.stale.items():
-            kept = [path for path in plan.outputs[item] if path not in stale]
-            keep_newer(kept, files_read((item, job), [item]))
+    journal.open([*todo, *(result.item for result in plan.rejected)])
 
     def done(result: ItemResult) -> int:
-        outputs = job.outputs_of(result.item) if result.made else ()  # may depend on what was made
-        journal.add(result.item, result.row(job.verb, options.output), result.made, outputs, plan.keys)
+        row, outputs = result.row(job.verb, options.output), plan.outputs[result.item]
+        journal.add(result.item, row, result.made, outputs, plan.keys)
         return _print_result(result, options)
 
     failures = sum(map(done, plan.rejected))
     if todo:
-        owner = (options.output, job.verb, journal.path, options.overwrite) if plan.keys else None
-        with closing(_results(job, todo, plan.outputs, owner, options, settings)) as results:
+        writes_of = partial(Writes, options.output, job.verb, journal.path, options.overwrite)
+        work = partial(_run_one, job.process, writes_of if plan.keys else None)
+        with closing(_results(job, work, todo, plan.outputs, options, settings)) as results:
             failures += sum(map(done, results))
     if failures and len(plan.outputs) > 1:
         log.error("%d of %d failed; %s has a row for each", failures, len(plan.outputs), journal.path)
@@ -243,20 +227,11 @@ def _to_make(item: Item, plan: Plan, journal: Journal, options: BatchOptions) ->
     return replace(item, stale=frozenset({*stale, *others}), kept=frozenset(outputs) - set(stale), key=key)
 
 
-def keep_newer(outputs: Sequence[Path], read: Iterable[Path]) -> None:
-    """Touch finished outputs that are older than a file they were made from, as Make expects."""
-    with suppress(OSError):
-        newest_ns = max((path.stat().st_mtime_ns for path in read), default=0) if outputs else 0
-        for path in outputs:
-            if path.stat().st_mtime_ns < newest_ns:
-                os.utime(path)
-
-
 def _results(
     job: Job,
+    work: Callable[[int, Item], ItemResult],
     todo: Sequence[Item],
     outputs: Outputs,
-    owner: Owner | None,
     options: BatchOptions,
     settings: Settings,
 ) -> Generator[ItemResult]:
@@ -264,7 +239,7 @@ def _results(
     items_per_process = job.items_a_process * options.in_a_row
     workers = options.workers(settings, default_job_count(len(todo), items_per_process, settings))
     at_once = min(workers.jobs or processors(), len(todo))
-    work = partial(_run_one, job.process, owner, settings.job_bytes(at_once))
+    work = partial(work, settings.job_bytes(at_once))
     memory.collect_as_usual()
 
     def died(item: Item, error: Exception) -> ItemResult:
@@ -283,11 +258,11 @@ def _results(
 
 
 def _run_one(
-    process: Callable[[Item], Outcome], owner: Owner | None, memory_bytes: int, item: Item
+    process: Callable[[Item], Outcome], writes_of: WritesOf | None, memory_bytes: int, item: Item
 ) -> ItemResult:
     """Run `process` on an item and return an `ItemResult`, even if it fails.
 
-    A job without recipes has no `owner`: it replaces its outputs.
+    A job without recipes, which has no `writes_of`, replaces its outputs.
     """
     start_s = time.perf_counter()
     memory.set_limit(memory_bytes)
@@ -298,10 +273,10 @@ def _run_one(
     try:
         if item.is_file:
             require_regular(item.input_path)
-        if owner is None:
+        if writes_of is None:
             return result(outcome=process(item))
         read = {} if item.is_drawn else file_row(item.input_path)
-        writes = Writes(item, *owner)
+        writes = writes_of(item)
         with ExitStack() as stack:
             stack.enter_context(asking(writes))
             if item.is_file:
@@ -342,13 +317,6 @@ def sums_up(
 
 def _exist(outputs: Sequence[Path]) -> bool:
     return bool(outputs) and all(path.is_dir() or regular_size(path) for path in outputs)
-
-
-def _rows_of(job: Job, plan: Plan, journal: Journal) -> Iterator[Row]:
-    """Yield the journal's rows of items; an item without a row was skipped."""
-    for item, outputs in plan.outputs.items():
-        skipped = ItemResult(item, 0.0, Outcome(outputs)).row(job.verb, Path()) | {"status": "skipped"}
-        yield journal.items.get((job.verb, item.name)) or skipped
 
 
 def _log_plan(plan: Plan) -> None:

@@ -17,6 +17,13 @@ from facerf_cli.run.workers import Workers
 Overwrite = Literal["never", "changed", "always"]
 T = TypeVar("T")
 NOT_IN_RECIPE = {"in_recipe": False}  # metadata of a field that shapes no output
+OUTPUT: dict[str, Any] = {  # the option of a command's output folder
+    "flags": ("--output", "-o"),
+    "shown_default": False,
+    "required": True,
+    "typed": Path,
+    "in_recipe": False,
+}
 _DEVICE = re.compile(r"auto|cpu|mps|cuda(:[0-9]{1,3})?")
 _SHARD = re.compile(r"([0-9]{1,9})/([0-9]{1,9})")
 _MOST_SEED = 2**63 - 1  # torch's
@@ -171,16 +178,7 @@ class BatchOptions:
         print_outputs: Whether names of outputs are printed to standard output.
     """
 
-    output: Path = option(
-        Path(),
-        metavar="DIR",
-        in_recipe=False,
-        flags=("--output", "-o"),
-        shown_default=False,
-        required=True,
-        typed=Path,
-        parse=folder_not_file,
-    )
+    output: Path = option(Path(), metavar="DIR", parse=folder_not_file, **OUTPUT)
     overwrite: Overwrite = option("changed", in_recipe=False, panel=BATCH, everyday=True)
     dry_run: bool = option(False, in_recipe=False, panel=BATCH)
     jobs: int | None = option(

@@ -22,8 +22,6 @@ from facerf_cli.files.read import read_image
 from facerf_cli.raster.camera import PosedCamera
 
 FIELDS = ("subject", "camera", "light")
-_FULL_NAMES = ("full", "full_on", "fullon", "all", "all_on")  # in place of a light: a frame with all lights
-_AMBIENT_WORDS = ("ambient", "dark", "black", "room", "background")  # in place of a light: a frame without
 _RESERVED = r"{}\:*?"  # wildcards of patterns, and characters that some file systems forbid
 _LONGEST = 500
 BlackLevel = float | tuple[float, float, float]
@@ -85,7 +83,6 @@ class Capture:
     positions_m: np.ndarray | None = None  # [L, 3] of near lights, in the world; NaN for far ones
     centre_m: np.ndarray = field(default_factory=lambda: np.zeros(3))  # [3], where intensities are measured
     stops: Mapping[str, float] = field(default_factory=dict)  # extra exposure of a subject's frames
-    ignored: frozenset[str] = frozenset()  # names in a light's place that belong to no single light
 
     def frame_path(self, subject: str, camera: str, light: str) -> Path:
         """Return the path of a subject's frame in a camera under one light."""
@@ -202,14 +199,6 @@ def find_subjects(folder: Path, pattern: str, cameras: list[str], lights: list[s
             if not is_name(name):
                 raise InputError(f"{folder}: subject {name!r}: use a name of letters, digits, - and _")
             yield name
-
-
-def unlisted_kind(name: str) -> str:
-    """Return 'full' or 'ambient' for an image whose name stands for no single light, else ''."""
-    plain = name.lower().strip("_- ")
-    if plain in _FULL_NAMES:
-        return "full"
-    return "ambient" if any(word in plain for word in _AMBIENT_WORDS) else ""
 
 
 def distorted(plane: Tensor, coefficients: Coefficients) -> Tensor:

@@ -1,25 +1,23 @@
 """First draft of `stage.json` for a folder of images; null for everything that a person must fill in.
 
 Lights and cameras come from the file names, sizes from the headers. Directions come from a list of lights
-beside the images (`.lp`, `light*.txt`, `light*.json`), if there is one. The entry "draft" contains the
+in the folder (`.lp`, `light*.txt`, `light*.json`), if there is one. The entry "draft" contains the
 inventory and the points to check.
 """
 
+import glob
 import json
 import logging
 import math
-import os
 import re
-from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
-from facerf_cli.batch.inputs import PHOTO_SUFFIXES
-from facerf_cli.capture.capture import FIELDS, compile_pattern, require_pattern, unlisted_kind
+from facerf_cli.capture.capture import FIELDS, compile_pattern, require_pattern
 from facerf_cli.capture.stage_json import FACING, STAGE_FILE, STAGE_FORMAT
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
@@ -34,12 +32,12 @@ _LONE_SUBJECT = "subject"  # id if it has no {subject}, and the folder's name ca
 _LEAST_LIGHTS = 3  # fewer determine no normals
 _LISTED = 3  # names of a note
 _DIGITS = 6
-_DEEPEST = 8  # folders below the capture that are searched
 _LIST_NAME = re.compile(r".*\.lp|light.*\.(txt|json)", re.IGNORECASE)
 _TO_FILL_IN = (
     "fill in each null: colour_space ('linear' for values in proportion to light with Rec.709 primaries, "
     "'sRGB' for images with a display curve), direction (unit vector in world space, toward the light), "
-    "world_to_camera (3 x 4 in metres, OpenCV axes), K, width and height (in pixels)"
+    "world_to_camera (3 x 4 in metres, OpenCV axes), K, width and height (in pixels); remove lights that are "
+    "several lights, or none"
 )
 
 Key = tuple[str, str, str]  # subject, camera and light; empty if the pattern does not name them
@@ -50,8 +48,7 @@ class Frames:
     """Images sorted by a pattern."""
 
     paths: dict[Key, str]
-    ambient: Counter[str]  # names in the light's place of images without lights
-    strays: list[str]  # images that do not match the pattern, or whose ids cannot be parts of file names
+    odd: list[str]  # images whose ids cannot be parts of file names
 
     def ids(self, field: str) -> list[str]:
         """Return the ids of all subjects, cameras or lights, numbers in their natural order: 2 before 10."""
@@ -68,7 +65,7 @@ def describe_capture(folder: Path, pattern: str, output: Path | None, dry_run: b
         raise UsageError(f"-o {path}: is a folder; use the draft's name, such as {path / STAGE_FILE}")
     if not dry_run and (path.exists() or path.is_symlink()):
         raise UsageError(f"{path}: already exists; a draft never overwrites, so move it or use another -o")
-    stage = draft_stage(folder, PHOTO_SUFFIXES, pattern)
+    stage = draft_stage(folder, pattern)
     for note in stage["draft"]:
         log.info("%s", note)
     if dry_run:
@@ -79,7 +76,7 @@ def describe_capture(folder: Path, pattern: str, output: Path | None, dry_run: b
     print(path)
 
 
-def draft_stage(folder: Path, suffixes: Collection[str], pattern: str) -> dict[str, Any]:
+def draft_stage(folder: Path, pattern: str) -> dict[str, Any]:
     """Draft the content of `stage.json`, with notes under "draft".
 
     Raises UsageError for a folder without a capture.
@@ -90,9 +87,8 @@ def draft_stage(folder: Path, suffixes: Collection[str], pattern: str) -> dict[s
         raise UsageError(
             "--pattern: missing; name the parts of a path, such as '{subject}/{camera}/{light}.exr'"
         )
-    images, lists = _scan_folder(folder, suffixes)
-    if not images:
-        raise UsageError(f"{folder}: no images found (looked for {' '.join(sorted(suffixes))})")
+    matching = folder.glob(re.sub(f"{{({'|'.join(FIELDS)})}}", "*", glob.escape(pattern)))
+    images = (path.relative_to(folder).as_posix() for path in matching if path.is_file())
     frames = frames_by_pattern(images, pattern)
     lights, cameras = frames.ids("light"), frames.ids("camera")
     if len(lights) < _LEAST_LIGHTS:
@@ -104,12 +100,12 @@ def draft_stage(folder: Path, suffixes: Collection[str], pattern: str) -> dict[s
     expected, missing = math.prod(counts), math.prod(counts) - len(frames.paths)
     exist = f"{missing} of {expected} frames are missing" if missing else f"all {expected} frames exist"
     notes = [f"{pattern}: {inventory}; {exist}", _TO_FILL_IN]
-    directions = _read_directions(folder, lists, frames, notes)
+    directions = _read_directions(folder, frames, notes)
     notes.append("check: lights: the intensity 1 1 1 is assumed of each; black_level: 0 is assumed")
-    if strays := frames.strays:
-        fault = "do not match the pattern, or have ids with other characters than letters, digits, - and _"
-        notes.append(f"left out: {counted(len(strays), 'image')} that {fault} ({_list(strays)})")
-    ambient, name = frames.ambient.most_common(1), folder.resolve().name
+    if odd := frames.odd:
+        fault = "have ids with other characters than letters, digits, - and _"
+        notes.append(f"left out: {counted(len(odd), 'image')} that {fault} ({_list(odd)})")
+    name = folder.resolve().name
     return {
         "format": STAGE_FORMAT,
         "draft": notes,
@@ -118,7 +114,6 @@ def draft_stage(folder: Path, suffixes: Collection[str], pattern: str) -> dict[s
         "axes": "opencv",
         "unit": "m",
         "pattern": pattern,
-        **({"ambient": pattern.replace("{light}", ambient[0][0])} if ambient else {}),
         "lights": [
             {"id": light, "direction": directions.get(light), "intensity": [1.0, 1.0, 1.0]}
             for light in lights
@@ -149,26 +144,25 @@ def _camera(folder: Path, camera: str, frames: Frames, is_alone: bool) -> dict[s
     return {**entry, "K": None, "world_to_camera": pose}
 
 
-def _read_directions(
-    folder: Path, lists: Sequence[str], frames: Frames, notes: list[str]
-) -> dict[str, Vector]:
+def _read_directions(folder: Path, frames: Frames, notes: list[str]) -> dict[str, Vector]:
     """Return directions of lights from the first list of lights, and add a note about it."""
+    lists = [path for path in sorted(folder.iterdir()) if _LIST_NAME.fullmatch(path.name) and path.is_file()]
     if not lists:
         return {}
     stems = {PurePosixPath(path).stem: light for (_, _, light), path in frames.paths.items()}
     light_ids = frames.ids("light")
     try:
-        listed = read_light_list(folder / lists[0])
+        listed = read_light_list(lists[0])
     except InputError as error:
         notes.append(f"left out: a list of lights: {error}")
         return {}
     vectors = match_lights(listed, light_ids, stems)
     if vectors:
         axes = "x right, y up, z toward the camera, as world space"
-        notes.append(f"check: lights: directions from {_list(lists[:1])}, {axes}")
+        notes.append(f"check: lights: directions from {_list([lists[0].name])}, {axes}")
     else:
         fault = f"its {len(listed)} lines name none of the {len(light_ids)} lights"
-        notes.append(f"left out: a list of lights: {folder / lists[0]}: {fault}")
+        notes.append(f"left out: a list of lights: {lists[0]}: {fault}")
     units = {light: np.array(vector) / np.linalg.norm(vector) for light, vector in vectors.items()}
     return {light: (unit.round(_DIGITS) + 0.0).tolist() for light, unit in units.items()}  # no -0.0
 
@@ -199,52 +193,24 @@ def _list(names: Sequence[str]) -> str:
     return ", ".join([*words, "..."] if len(names) > _LISTED else words)
 
 
-def _scan_folder(folder: Path, suffixes: Collection[str]) -> tuple[list[str], list[str]]:
-    """Find images with these suffixes, and lists of lights, the uppermost first.
+def frames_by_pattern(paths: Iterable[str], pattern: str) -> Frames:
+    """Sort paths of images by a pattern.
 
-    Paths are relative to the folder, with / between names. Hidden files and folders are skipped. Links to
-    folders are followed, but each folder is entered once.
-    """
-    images: list[str] = []
-    lists: list[str] = []
-    entered: set[str] = set()
-    for here, folders, files in os.walk(folder, followlinks=True):
-        below, real = Path(here).relative_to(folder), os.path.realpath(here)
-        folders[:] = sorted(name for name in folders if name[0] != "." and len(below.parts) < _DEEPEST)
-        if real in entered:
-            folders.clear()
-            continue
-        entered.add(real)
-        for name in sorted(name for name in files if name[0] != "."):
-            path = (below / name).as_posix()
-            if os.path.splitext(name)[1].lower() in suffixes:
-                images.append(path)
-            elif _LIST_NAME.fullmatch(name) and (folder / path).is_file():
-                lists.append(path)
-    return images, sorted(lists, key=lambda path: (path.count("/"), path))
-
-
-def frames_by_pattern(images: Sequence[str], pattern: str) -> Frames:
-    """Sort images into frames, ambient images and strays; images with all lights on are skipped.
-
-    Raises UsageError for a wrong pattern, or one that matches no image.
+    Raises UsageError for a wrong pattern, or one that no image fits.
     """
     try:
         expression = compile_pattern(require_pattern(pattern, "--pattern", ["light"]))
     except InputError as error:
         raise UsageError(str(error)) from None
-    frames = Frames({}, Counter(), [])
-    for path in sorted(images):
-        match = expression.fullmatch(path)
+    frames = Frames({}, [])
+    for path, match in [(path, expression.fullmatch(path)) for path in sorted(paths)]:
         named = match.groupdict() if match else {}
-        if named and (kind := unlisted_kind(named["light"])):
-            frames.ambient.update([named["light"]] if kind == "ambient" else [])
-        elif not named or not all(map(is_name, named.values())):
-            frames.strays.append(path)
+        if not named or not all(map(is_name, named.values())):
+            frames.odd.append(path)
         else:
             frames.paths[named.get("subject", ""), named.get("camera", ""), named["light"]] = path
     if not frames.paths:
-        raise UsageError(f"--pattern {pattern}: matches no image, not even {images[0]}; correct the pattern")
+        raise UsageError(f"--pattern {pattern}: matches no image; correct the pattern")
     return frames
 
 

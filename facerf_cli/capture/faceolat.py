@@ -62,7 +62,7 @@ def read_faceolat(folder: Path, is_linear: bool) -> Capture:
         read_document(folder / "lights/light_pattern_metadata.json", _Positions, "copy it").light_positions
     )
     centre = sphere_centre(places)
-    names, others = _frames(folder, len(places), int(first.name.split(".")[1]), width)
+    names = _frames(folder, len(places), int(first.name.split(".")[1]), width)
     numbers = sorted(names)
     pattern = f"{{camera}}/{{subject}}/{{subject}}.{{light}}{suffix}"
     cameras = {}
@@ -103,28 +103,20 @@ def read_faceolat(folder: Path, is_linear: bool) -> Capture:
         colour_matrix=matrix,
         positions_m=near,
         stops=stops,
-        ignored=others,
     )
     return capture.about(np.zeros(3))
 
 
-def _frames(folder: Path, lights: int, first: int, width: int) -> tuple[dict[int, str], frozenset[str]]:
-    """Return the frames' names by light, and the names of frames that show no single light.
-
-    The first file of a take has the number `first`, with `width` digits.
-    """
+def _frames(folder: Path, lights: int, first: int, width: int) -> dict[int, str]:
+    """Return the names of frames of one light, by light; the first file of a take has the number `first`."""
     path = folder / "lights/light_pattern_per_frame.json"
-    pairs = read_document(path, list[list[int]], "copy it")
-    of_lights, others = {}, set()
-    for pair in pairs:
+    names = {}
+    for pair in read_document(path, list[list[int]], "copy it"):
         if len(pair) != 2 or not (0 <= pair[0] <= _MOST_FRAMES and 0 <= pair[1] <= lights):
             raise InputError(f"{path}: {pair} is not a frame and one of {lights} lights; copy it again")
-        name = f"{pair[0] + first:0{width}d}"
         if pair[1]:
-            of_lights[pair[1] - 1] = name
-        else:
-            others.add(name)
-    return of_lights, frozenset(others)
+            names[pair[1] - 1] = f"{pair[0] + first:0{width}d}"
+    return names
 
 
 def _colours(path: Path) -> tuple[np.ndarray, BlackLevel]:

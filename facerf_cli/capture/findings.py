@@ -33,7 +33,6 @@ MISSING, MARKED = "missing", "marked as damaged"
 CONSEQUENCES = ("subject stopped", "frame left out", "warning")
 _LISTED = 6  # entries of a log line; the others are counted
 FINDINGS_FILE, _FOLDER = "findings.jsonl", "findings"
-_MOST_SIMILAR = 3  # findings of one check in a camera; the table counts the others
 _PLAIN_WIDTH = 160  # columns of a table in a log file
 
 
@@ -206,7 +205,7 @@ def _parse(row: str) -> Finding:
 
 
 def show_findings(findings: Sequence[Finding], strict: bool = False, console: Console = STDERR) -> None:
-    """Print a table of findings, if there are any: errors first, then by subject; similar ones are counted.
+    """Print a table of findings, if there are any: errors first, then by subject; similar ones in one row.
 
     With `strict`, each of them stops its subject.
     """
@@ -225,13 +224,10 @@ def show_findings(findings: Sequence[Finding], strict: bool = False, console: Co
         return consequence, finding.subject, finding.camera or "", finding.check
 
     for (consequence, *_), group in groupby(sorted(findings, key=key), key):
-        similar = list(group)
-        words = [one_line(finding.words) for finding in similar[:_MOST_SIMILAR]]
-        if (more := len(similar) - _MOST_SIMILAR) > 0:
-            words[-1] += f" (and {more} more like it)"
-        for finding, line in zip(similar, words, strict=False):
-            result = CONSEQUENCES[consequence]
-            styled = Text(result, "yellow" if result == "warning" else "red")
-            table.add_row(Text(finding.place), Text(finding.check), styled, Text(line))
+        first, *others = group
+        words = one_line(first.words) + f" (and {len(others)} more like it)" * bool(others)
+        result = CONSEQUENCES[consequence]
+        styled = Text(result, "yellow" if result == "warning" else "red")
+        table.add_row(Text(first.place), Text(first.check), styled, Text(words))
     wide = console if console.is_terminal else Console(file=console.file, width=_PLAIN_WIDTH)
     wide.print(table)

@@ -19,8 +19,7 @@ without a pose defines the world: x right, y up, z toward the camera.
 A light with a position, in metres in the world, is near: its direction depends on the fitted head, and its
 intensity, stated for "centre" (by default the world's origin), on the square of the distance. "colour_matrix"
 [3, 3] applies to linear values without the black level, which may differ between channels. "exposure_stops"
-{subject: stops} states which frames are brighter. "ignore" lists names in a light's place that belong to no
-single light, for example tracking frames.
+{subject: stops} states which frames are brighter.
 
 Without `subjects`, every name that the pattern finds on disk is a subject. "ambient", for example
 "{subject}/{camera}/ambient.exr", is optional: images without any light, which --subtract-ambient subtracts
@@ -188,7 +187,6 @@ class StageDocument(Document):
     exposure_stops: dict[Name, Annotated[float, Field(ge=-_MOST_STOPS, le=_MOST_STOPS)]] = Field(
         default_factory=dict
     )
-    ignore: Annotated[list[str], Field(max_length=MOST_LIGHTS)] = Field(default_factory=list)
     pattern: str
     lights: Annotated[list[LightEntry], Field(min_length=1, max_length=MOST_LIGHTS)]
     cameras: Annotated[list[CameraEntry], Field(min_length=1, max_length=MOST_CAMERAS)]
@@ -243,6 +241,5 @@ def read_stage(folder: Path) -> Capture:
         positions_m=None if np.isnan(positions).all() else positions,
         centre_m=stage.centre,
         stops=stage.exposure_stops,
-        ignored=frozenset(stage.ignore),
     )
     return capture.about(stage.centre)

@@ -103,10 +103,8 @@ class YaleB:
     def image(self, subject: str, flash: Flash) -> np.ndarray:
         """Read the image [192, 168] of a subject under one flash, float32 in 0..1, without a display curve.
 
-        Raises InputError for an image that is missing, unreadable or has another size.
+        Raises InputError for an image that is unreadable or has another size.
         """
-        if flash not in self.files[subject]:
-            raise InputError(f"{self.folder / subject}: no image under {flash.name}; copy the folder again")
         path = self.files[subject][flash]
         image = read_image(path, "linear").pixels[..., 0]
         if image.shape != (HEIGHT_PX, WIDTH_PX):
@@ -168,20 +166,15 @@ def read_shifts(path: Path) -> dict[tuple[str, Flash], tuple[int, int]]:
     Other columns are ignored. An InputError names the first invalid row.
     """
     advice = "write lines subject,light,dy,dx under such a header"
-    shifts = {}
+    shifts, rows = {}, csv.DictReader(read_text(path, advice).splitlines())
     try:
-        rows = list(csv.DictReader(read_text(path, advice).splitlines()))
-    except csv.Error as error:
-        raise InputError(f"{path}: not a list of shifts ({error}); {advice}") from None
-    for number, row in enumerate(rows, start=2):
-        subject, flash = row.get("subject"), Flash.named(row.get("light") or "")
-        try:
-            down, right = int(row.get("dy") or ""), int(row.get("dx") or "")
-        except ValueError:
-            flash = None
-        if not subject or flash is None or max(abs(down), abs(right)) >= WIDTH_PX:
-            raise InputError(f"{path}: line {number} is invalid; {advice}")
-        shifts[subject, flash] = down, right
+        for row in rows:
+            flash, down, right = Flash.named(row["light"]), int(row["dy"]), int(row["dx"])
+            if flash is None or max(abs(down), abs(right)) >= WIDTH_PX:
+                raise ValueError
+            shifts[row["subject"], flash] = down, right
+    except (csv.Error, KeyError, TypeError, ValueError):
+        raise InputError(f"{path}: line {rows.line_num} is invalid; {advice}") from None
     if not shifts:
         raise InputError(f"{path}: no shifts; {advice}")
     return shifts

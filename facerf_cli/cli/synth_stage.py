@@ -29,12 +29,12 @@ class Photograph(Job):
         """Draw and render a person."""
         from facerf_cli.run.workers import one_thread
         from facerf_cli.synth.bank.heads import cached_face_model
+        from facerf_cli.synth.person import draw_person
         from facerf_cli.synth.stage import write_subject
-        from facerf_cli.synth.subjects import draw_subject
 
         model = cached_face_model(self.stage.face_model)
         with one_thread():
-            subject = draw_subject(model, int(item.name), self.stage.seed, self.stage.size_px)
+            subject = draw_person(model, int(item.name), self.stage.seed, self.stage.size_px)
             write_subject(item.output_base, subject, self.stage)
         return Outcome(self.outputs_of(item), {"traits": subject.traits})
 

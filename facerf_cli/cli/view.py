@@ -64,5 +64,5 @@ def view(
         from facerf_cli.work.view import write_index
 
         write_index(output / _INDEX, items, photo)
-        journal.own(output / _INDEX)
+        journal.add_file(output / _INDEX)
     raise typer.Exit(code)

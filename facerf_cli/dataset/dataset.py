@@ -1,4 +1,4 @@
-"""Paths of a prepared dataset (DESIGN, 'Files'), and the model of its `dataset.json`.
+"""Paths of a prepared dataset (docs/light-stage.md), and the model of its `dataset.json`.
 
     dataset.json               lights, cameras, normalisation, splits, subjects; written last
     findings.jsonl             findings of the capture's checks (`capture/findings.py`)
@@ -7,9 +7,9 @@
     fits/SUBJECT.json          record of the subject; written last of the subject's files
     sheets/SUBJECT.jpg, index.html
 
-Lights and cameras in dataset.json are in DESIGN's axes (x right, y up, z toward the camera) and the capture's
-world space; each stack contains its lights in its own crop's camera space. A subject without some of the
-lights lists the others (`lights`, in the order of its stacks' parts) and the reasons (`left_out`).
+Lights and cameras in dataset.json are in the package's axes (x right, y up, z toward the camera) and the
+capture's world space; each stack contains its lights in its own crop's camera space. A subject without some
+of the lights lists the others (`lights`, in the order of its stacks' parts) and the reasons (`left_out`).
 """
 
 import hashlib

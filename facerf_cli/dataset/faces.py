@@ -5,7 +5,7 @@ written. Samples replace the synthetic ones of `synth/bank/texture_samples.py`.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ from facerf_cli.network.batch import Batch
 from facerf_cli.network.inputs import MEAN_RADIANCE, resize
 from facerf_cli.raster.texture import inpaint, normal_map
 from facerf_cli.synth.bank.heads import HeadBakeSettings, bake_head
-from facerf_cli.synth.bank.texture_samples import CameraResponse, Sample, camera_matrix, draw_target_lights
+from facerf_cli.synth.bank.texture_samples import TEXTURE_CAMERA, Sample, draw_target_lights, exposed
 from facerf_cli.synth.camera import recoloured
 
 _LEAST_INSIDE = 0.9  # fraction of a texel's pixels that must lie on the face and inside the photo
@@ -87,12 +87,11 @@ class SampleCrops(Batch):
     """Crops of a `Sample`: B sources, and their targets under L lights each.
 
     Attributes:
-        source: One image of each face.
+        source: One photo of each face, by a simulated camera.
         target: L images of each face, by the target's camera.
         turn: [B, 3, 3], from the source's camera space to the target's.
         lights: [B, L, 3], unit vectors in the target's camera space.
         colours: [B, 3, 3], from true colours to an exposed camera's.
-        response: The cameras of the sources.
     """
 
     source: FaceCrops
@@ -100,7 +99,6 @@ class SampleCrops(Batch):
     turn: Tensor
     lights: Tensor
     colours: Tensor
-    response: CameraResponse
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +132,7 @@ class DatasetFaces:
     def source_colours(self, count: int, generator: torch.Generator) -> Tensor:
         """Measure mean colours [N, 3] of about `count` training sources, as random cameras see them."""
         colours = self.train.source_colours(count)
-        return torch.stack([camera_matrix(generator) @ colour for colour in colours]).double()
+        return torch.stack([TEXTURE_CAMERA.colours(generator) @ colour for colour in colours]).double()
 
     def draw_shared(
         self, lights: int, generator_of: Callable[..., torch.Generator], index: int, step: int
@@ -170,15 +168,17 @@ class DatasetFaces:
         chosen = draw_target_lights(info.directions, min(lights, self.fewest_lights), generator)
         chosen = torch.cat([torch.tensor([pair.target_light]), chosen[chosen != pair.target_light]])
         chosen = chosen[: min(lights, self.fewest_lights)]
-        colours = camera_matrix(generator)
+        colours = TEXTURE_CAMERA.colours(generator)
         exposure = MEAN_RADIANCE / (colours @ source_info.lit_colour).mean()
+        crops = self._crops(pair.subject, pair.source_camera, source[None])
+        image = recoloured(crops.images[0, 0].float(), colours)
+        photo = TEXTURE_CAMERA.take(image, image.mean(0)[crops.seen[0, 0] > 0].mean(), generator)
         return SampleCrops(
-            source=self._crops(pair.subject, pair.source_camera, source[None]),
+            source=replace(crops, images=photo[None, None]),
             target=self._crops(pair.subject, pair.target_camera, _read_face(path, info, chosen.tolist())),
             turn=(info.rotation @ source_info.rotation.T)[None],
             lights=info.directions[chosen][None],
             colours=(exposure * colours)[None],
-            response=CameraResponse.draw(1, self.side, generator),
         )
 
     def draw_lights(self, people: Tensor, lights: int, generator: torch.Generator) -> LitCrops:
@@ -190,7 +190,7 @@ class DatasetFaces:
         info = stack_info(path)
         chosen = draw_target_lights(info.directions, min(lights, self.fewest_lights), generator).tolist()
         crops = self._crops(subject, camera, _read_face(path, info, chosen))
-        colours = camera_matrix(generator) * (MEAN_RADIANCE / info.lit_mean)
+        colours = TEXTURE_CAMERA.colours(generator) * (MEAN_RADIANCE / info.lit_mean)
         directions = info.directions[chosen] @ info.rotation  # R^T w, of row vectors
         return LitCrops(crops, colours[None], directions[None], people)
 
@@ -205,10 +205,10 @@ class DatasetFaces:
         return FaceCrops(images[None], seen, info.fit.vertices_camera(self.model)[None], number)
 
     def sample(self, crops: SampleCrops) -> Sample:
-        """Unwrap the faces of a sample, with the sources as their cameras would see them."""
+        """Unwrap the faces of a sample."""
         source, visible = self.unwrapped(crops.source)
         target, target_visible = self.unwrapped(crops.target)
-        photo = crops.response.apply(recoloured(source, crops.colours[:, None])[:, 0], visible)
+        photo = exposed(source[:, 0], visible)
         normals = normal_map(crops.source.vertices, on_device(photo.device, grid_triangles), self.side)
         return Sample(
             source=inpaint(photo, visible[:, 0]),

@@ -31,10 +31,11 @@ from facerf_cli.dataset.weights import (
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import checked, digest
+from facerf_cli.files.image_metadata import attributes_of_sum
 from facerf_cli.files.olat_stack import read_olat_header
 from facerf_cli.files.texts import parse_json, text_of
 from facerf_cli.files.write import write_exr
-from facerf_cli.run.logs import LOGGER_NAME, attributes_of_sum, json_line
+from facerf_cli.run.logs import LOGGER_NAME, json_line
 
 RELIT, PAIRS_NAME = "relit", "pairs.jsonl"
 DRAW_AGAIN = f"move the folder {RELIT} elsewhere and run relight-dataset"

@@ -13,12 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli.batch.recipe import Recipe, key_of, text_of_state
+from facerf_cli.batch.recipe import Recipe, key_of
 from facerf_cli.dataset.crops import CropMove
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import from_landmarks
 from facerf_cli.files.documents import Document, Points68, read_document, write_document
 from facerf_cli.files.read import read_image
+from facerf_cli.files.texts import text_of_state
 from facerf_cli.files.write import write_display
 from facerf_cli.network.batch import Batch
 from facerf_cli.portrait.find import find_faces

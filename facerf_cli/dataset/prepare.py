@@ -36,6 +36,7 @@ from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
 from facerf_cli.face.view import draw_fit
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import read_document, write_document
+from facerf_cli.files.image_metadata import COMPUTER_GRAPHICS_SOURCE_TYPE, Provenance
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
 from facerf_cli.files.sheets import contact_sheet, mark_light
 from facerf_cli.files.write import HALF_MAX, write_display
@@ -46,7 +47,7 @@ from facerf_cli.portrait.find import choose_face, detect_faces
 from facerf_cli.raster.rasterize import front_facing, interpolate, rasterize
 from facerf_cli.raster.texture import vertex_normals
 from facerf_cli.relighting.models import Networks
-from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE, LOGGER_NAME, Provenance
+from facerf_cli.run.logs import LOGGER_NAME
 
 _TILE_PX = 192
 _SHEET_AZEL_DEG = ((0.0, 15.0), (-60.0, 20.0), (60.0, 20.0))  # front, left and right, in camera space

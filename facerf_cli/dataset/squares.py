@@ -22,13 +22,13 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from facerf_cli.batch.recipe import is_made_from, text_of_state
 from facerf_cli.dataset.dataset import Dataset, people_of, provenance_of, read_dataset
 from facerf_cli.errors import InputError
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.olat_stack import read_olat_header, read_olats
+from facerf_cli.files.texts import is_made_from, text_of_state
 from facerf_cli.files.write import HALF_MAX
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.portrait.person import SIDE_PX

@@ -23,9 +23,8 @@ from facerf_cli.batch.inputs import PHOTO_SUFFIXES
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation.measure import Case
 from facerf_cli.evaluation.options import Chosen, CompareOptions
-from facerf_cli.files.arrays import read_array
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.read import LinearImage, read_image
+from facerf_cli.files.read import LinearImage, read_array, read_image
 from facerf_cli.files.texts import read_text
 
 CASES, SOURCE, TRUTH, MASK, LIGHT = "cases.csv", "source", "truth", "mask", "light"

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -143,10 +143,6 @@ METRICS: Mapping[str, Metric] = {  # in the order of tables; a row contains the 
 }
 
 
-def _null_to_nan(value: Any) -> Any:
-    return math.nan if value is None else value
-
-
 @dataclass(frozen=True)
 class Row:
     """Metrics of one method on one image, `values` by name, with the facts of its case."""
@@ -155,7 +151,7 @@ class Row:
     person: str
     method: str
     facts: Mapping[str, str | int | float]
-    values: Mapping[str, Annotated[float, BeforeValidator(_null_to_nan)]]
+    values: Mapping[str, Annotated[float, BeforeValidator(lambda x: math.nan if x is None else x)]]
 
 
 def measure(

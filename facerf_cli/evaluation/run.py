@@ -36,9 +36,10 @@ from facerf_cli.evaluation.report import (
 from facerf_cli.evaluation.summary import print_tables, summarise
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import json_text
+from facerf_cli.files.image_metadata import Provenance
 from facerf_cli.files.write import write_exr
 from facerf_cli.network.files import serving_files
-from facerf_cli.run.logs import LOGGER_NAME, Provenance, json_line
+from facerf_cli.run.logs import LOGGER_NAME, json_line
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import face_model, prepare_photos
 

@@ -1,9 +1,8 @@
 """Atomic writes, and locks of output folders.
 
-An output is written into a hidden folder next to it, synced to the disk, and renamed. Only this process uses
-the hidden folder, and links that another user has put there are not followed. A power cut leaves the old or
-the new output: data is on the disk before the rename, and the rename before the next step (Pillai et al.,
-'All File Systems Are Not Created Equal', OSDI 2014).
+An output is written into a hidden folder next to it, which only this process uses, synced to the disk, and
+renamed. A power cut leaves the old or the new output: data is on the disk before the rename, and the rename
+before the next step (Pillai et al., 'All File Systems Are Not Created Equal', OSDI 2014).
 
 A run holds the lock of its output folder; the next run waits for it. The lock ends with its process.
 """
@@ -14,6 +13,7 @@ import hashlib
 import logging
 import os
 import platform
+import re
 import secrets
 import shutil
 import time
@@ -26,8 +26,8 @@ from facerf_cli.run.logs import LOGGER_NAME, printable_line
 from facerf_cli.run.stopping import clean_by, end_again
 
 _ABANDONED_S = 24 * 3600  # age of another machine's temporary folder that counts as abandoned
-_MARK = ".part-"
-_LONGEST_STEM = 40  # characters of a name, of up to 4 bytes, in the name of its temporary folder
+_MARK = ".part-"  # start of a temporary folder's name
+_TEMPORARY = re.compile(r"\.part-([0-9a-f]{8})-(\d+)-[0-9a-f]+")  # with its machine and process
 # Errors of one output's path, which fail its item; others, such as a full disk, end the run.
 _OF_ONE_PATH = {errno.ENAMETOOLONG, errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.EILSEQ}
 _NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS}  # NFS, SMB and Lustre without them
@@ -63,7 +63,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
             os.replace(temporary, path)
             for written in _watched:
                 written.append(path)
-            _sync_folder(path.parent)
+            with suppress(OSError):  # some file systems do not sync folders
+                _sync(path.parent)
     except OSError as error:
         kind = InputError if error.errno in _OF_ONE_PATH else FacerfError
         raise kind(f"{path}: cannot write: {error.strerror or error}") from error
@@ -76,8 +77,7 @@ def hidden_folder(path: Path) -> Iterator[Path]:
     if (absolute := Path(os.path.abspath(path.parent))) not in _swept:  # once per folder, not per file
         _swept.add(absolute)
         sweep_leftovers(path.parent)
-    name = f".{path.stem[:_LONGEST_STEM]}{_MARK}{machine_id()}-{os.getpid()}-{secrets.token_hex(4)}"
-    room = path.parent / name
+    room = path.parent / f"{_MARK}{machine_id()}-{os.getpid()}-{secrets.token_hex(4)}"
     _open.add(room)
     try:  # before it is created: an interrupt may come at any time
         room.mkdir(mode=0o700)
@@ -119,7 +119,7 @@ def sweep_leftovers(folder: Path) -> None:
     """Remove temporary folders of ended processes from a folder."""
     with suppress(OSError):
         for entry in os.scandir(folder):
-            if entry.name.startswith(".") and _MARK in entry.name and _is_abandoned(entry):
+            if _is_abandoned(entry):
                 _remove(Path(entry.path))
 
 
@@ -130,11 +130,11 @@ def _remove_own() -> None:
 
 def is_temporary(path: Path) -> bool:
     """Return whether a path is in a temporary folder of `atomic_path`."""
-    return any(part.startswith(".") and _MARK in part for part in path.parts)
+    return any(part.startswith(_MARK) for part in path.parts)
 
 
 clean_by(_remove_own)
-atexit.register(_remove_own)  # again, after a Ctrl-C during the removal
+atexit.register(_remove_own)  # folders that are still in use, and after a Ctrl-C during a removal
 
 
 def machine_id() -> str:
@@ -143,18 +143,16 @@ def machine_id() -> str:
 
 
 def _is_abandoned(leftover: os.DirEntry[str]) -> bool:
-    machine, _, rest = leftover.name.rpartition(_MARK)[2].partition("-")
-    owner = rest.partition("-")[0]
-    if len(machine) != len(machine_id()) or not owner.isdecimal():
+    if (match := _TEMPORARY.fullmatch(leftover.name)) is None:
         return False
+    machine, owner = match.groups()
     try:
         if machine != machine_id():
             return time.time() - leftover.stat(follow_symlinks=False).st_mtime > _ABANDONED_S
-        if os.name != "nt":  # where os.kill would end the process
-            os.kill(int(owner), 0)
+        os.kill(int(owner), 0)
     except (ProcessLookupError, OverflowError):
         return True
-    except OSError:  # another user's process, or a folder that its process has just renamed or removed
+    except OSError:  # another user's process, or a folder that was just removed
         pass
     return False
 
@@ -167,32 +165,18 @@ def _remove(path: Path) -> None:
 
 
 def _sync_all(path: Path) -> None:
-    """Sync a file, or everything in a folder, to the disk."""
-    if not path.is_dir():
-        _sync(path)
-        return
-    for here, _, files in os.walk(path):
-        for name in files:
-            _sync(Path(here) / name)
-        _sync_folder(Path(here))
+    """Sync a file, or a folder and everything in it, to the disk."""
+    for inside in path.rglob("*") if path.is_dir() else ():
+        _sync(inside)
+    _sync(path)
 
 
 def _sync(path: Path) -> None:
-    follow = 0 if path.is_dir() else getattr(os, "O_NOFOLLOW", 0)  # folders may be links
-    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | follow)
+    descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _sync_folder(folder: Path) -> None:
-    """Sync a folder's names to the disk if its file system supports that."""
-    try:
-        _sync(folder)
-    except OSError as error:
-        if error.errno not in (errno.EINVAL, errno.EACCES, errno.EBADF, errno.ENOTSUP, errno.EISDIR):
-            raise
 
 
 @contextmanager
@@ -227,12 +211,10 @@ def alone_in(folder: Path, name: str) -> Iterator[None]:
             "%s: the file system has no locks (%s); run only one facerf there", folder, error.strerror
         )
     try:
-        with suppress(PermissionError):  # on Windows, for a locked file
-            path.write_text(str(os.getpid()))
+        path.write_text(str(os.getpid()))
         yield
     finally:
-        with suppress(PermissionError):
-            path.unlink(missing_ok=True)  # before the release, so that waiting processes see a new file
+        path.unlink(missing_ok=True)  # before the release, so that waiting processes see a new file
         lock.release()
         with suppress(OSError):
             for empty in created:

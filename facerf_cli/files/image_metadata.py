@@ -10,7 +10,6 @@ import shutil
 import struct
 import zlib
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -18,13 +17,22 @@ from xml.sax.saxutils import quoteattr
 
 import OpenImageIO as oiio
 
+from facerf_cli._version import __version__
 from facerf_cli.errors import InputError
 from facerf_cli.files.read import metadata_of, open_image, shown_size
-from facerf_cli.files.spaces import default_space, is_floating, stated_space
+from facerf_cli.files.spaces import is_floating
 from facerf_cli.files.workarounds import utf8_path
-from facerf_cli.image.colour import ColourSpace
 
 Attributes = Mapping[str, str | int | float]
+
+# IPTC's digital source types (cv.iptc.org/newscodes/digitalsourcetype): changed by a trained model,
+COMPOSITE_SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/compositeWithTrainedAlgorithmicMedia"
+
+# computed entirely,
+COMPUTER_GRAPHICS_SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/algorithmicMedia"
+
+# and sums of photographs.
+_CAPTURES_SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/compositeCapture"
 
 _PNG_SIGNATURE, _JPEG_START = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 _TIFF_START, _TIFF_XMP_TAG = b"II*\0", 700
@@ -47,14 +55,54 @@ _TUPLES = {"smpte:TimeCode": "timecode", "smpte:KeyCode": "keycode"}
 
 
 @dataclass(frozen=True)
+class Provenance:
+    """Origin of a result, for the metadata of every output.
+
+    `face_model` and its licence are `MorphableModel.stamp`; `source_type` is '' for images that are not
+    synthetic, such as a cropped photograph.
+    """
+
+    input_name: str = ""
+    checkpoint_name: str = ""
+    face_model: str = ""
+    face_model_licence: str = ""
+    source_type: str = COMPOSITE_SOURCE_TYPE
+    key: str = ""  # of the file of `-o FILE`, so that a later run recognises it
+
+    def attributes(self) -> dict[str, str | int]:
+        """Return metadata for a file's header, without empty fields."""
+        attributes: dict[str, str | int] = {
+            "Software": f"facerf {__version__}",
+            "facerf:version": __version__,
+            "facerf:synthetic": 1 if self.source_type else "",
+            "IPTC:DigitalSourceType": self.source_type,
+            "facerf:input": self.input_name,
+            "facerf:checkpoint": self.checkpoint_name,
+            "facerf:face_model": self.face_model,
+            "facerf:face_model_licence": self.face_model_licence,
+            "facerf:key": self.key,
+        }
+        return {name: value for name, value in attributes.items() if value != ""}
+
+
+def attributes_of_sum(stack: Mapping[str, Any], stack_name: str = "", key: str = "") -> dict[str, Any]:
+    """Return metadata for weighted sums of a stack's images, from the stack's metadata.
+
+    Sums of photographs are also marked as synthetic, since their light did not exist.
+    """
+    default = Provenance(stack_name, source_type=_CAPTURES_SOURCE_TYPE)
+    of_stack = {name: value for name, value in stack.items() if name != "facerf:key"}
+    return default.attributes() | of_stack | Provenance(source_type="", key=key).attributes()
+
+
+@dataclass(frozen=True)
 class Header:
-    """Upright size, number format, colour space and metadata."""
+    """Upright size, number format and metadata."""
 
     width_px: int
     height_px: int
     is_floating: bool
     bits: int  # per value
-    space: ColourSpace  # stated, or linear Rec.709 for floats and sRGB for integers
     metadata: dict[str, Any]
 
 
@@ -68,11 +116,8 @@ def read_header(path: Path) -> Header | None:
             spec = opened.spec
     except InputError:  # not an image, damaged, or pi-heif is missing
         return None
-    space = default_space(spec)
-    with suppress(InputError):  # an HDR image, whose pixels are not supported
-        space = stated_space(path, spec) or space
     height, width = shown_size(spec)
-    return Header(width, height, is_floating(spec), 8 * spec.format.size(), space, metadata_of(spec))
+    return Header(width, height, is_floating(spec), 8 * spec.format.size(), metadata_of(spec))
 
 
 def plate_metadata(metadata: Mapping[str, Any]) -> dict[str, Any]:

@@ -8,8 +8,9 @@ HEIC and HEIF, the formats of phones, are decoded by pi-heif, an extra (`facerf[
 import importlib.util
 import io
 import logging
+import re
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -168,33 +169,14 @@ def _deep_values(image: Any) -> np.ndarray | None:
         return None
 
 
-def _boxes(content: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """Yield the kind and the content of each box in order."""
-    at = 0
-    while at + 8 <= len(content):
-        size, kind = struct.unpack_from(">I4s", content, at)
-        head = 8
-        if size == 1:
-            (size,), head = struct.unpack_from(">Q", content, at + head), 16
-        end = at + size if size else len(content)
-        if end < at + head:
-            return
-        yield kind, content[at + head : end]
-        at = end
-
-
 def _stated(content: bytes) -> tuple[int, tuple[int, int] | None, bool]:
     """Return bits per value, codes of primaries and curve, and True for premultiplied alpha (ISO 23008-12).
 
-    The main image's properties precede those of its alpha and thumbnails.
+    In the list of properties (ipco), those of the main image precede those of its alpha and thumbnails.
     """
-    try:
-        meta = dict(_boxes(dict(_boxes(content))[b"meta"][4:]))
-        properties = list(_boxes(dict(_boxes(meta[b"iprp"]))[b"ipco"]))
-        flags = next((body for kind, body in properties if kind == b"av1C"), bytes(4))[2]
-        codes = [body for kind, body in properties if kind == b"colr" and body[:4] == b"nclx"]
-        bits = (12 if flags & _TWELVE else 10) if flags & _DEEP else 8
-        is_associated = b"prem" in dict(_boxes(meta.get(b"iref", b"")[4:]))
-        return bits, struct.unpack_from(">HH", codes[0], 4) if codes else None, is_associated
-    except (KeyError, IndexError, struct.error):
-        return 8, None, False
+    configuration = re.search(rb"ipco.*?av1C..(.)", content, re.DOTALL)
+    codes = re.search(rb"ipco.*?colrnclx(.{4})", content, re.DOTALL)
+    flags = configuration[1][0] if configuration else 0
+    bits = (12 if flags & _TWELVE else 10) if flags & _DEEP else 8
+    is_associated = re.search(rb"iref.*?prem..\x00\x01", content, re.DOTALL) is not None
+    return bits, struct.unpack(">HH", codes[1]) if codes else None, is_associated

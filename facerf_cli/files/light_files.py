@@ -39,7 +39,7 @@ class LightRecord:
     """Contents of a JSON light: directions and weights [L, 3] of a rig, and optionally coefficients `sh`.
 
     Coefficients [(order + 1)^2, 3] are those of `light.sh`. `rig` describes the directions in words;
-    `attributes` are the provenance (`logs.Provenance.attributes`) and how the light was estimated.
+    `attributes` are the provenance (`image_metadata.Provenance.attributes`) and how the light was estimated.
     """
 
     directions: Tensor

@@ -7,10 +7,12 @@ Data and display windows apply only to EXR: in other formats an offset positions
 """
 
 import logging
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -165,7 +167,7 @@ def decode(
         raise InputError(f"{path}: the file is empty; specify an image file")
     for _ in workarounds.png_chunks(path):  # checks all of them
         pass
-    with open_image(path, layer, limit_px, kept_px) as image:
+    with open_image(path, layer, limit_px) as image:
         form, spec = image.form, image.spec
         if image.choice:
             log.info("%s: %s", path, image.choice)
@@ -197,18 +199,17 @@ def decode(
 
 
 @contextmanager
-def open_image(path: Path, layer: str | None = None, limit_px: int = 0, kept_px: int = 0) -> Iterator[Opened]:
+def open_image(path: Path, layer: str | None = None, limit_px: int = 0) -> Iterator[Opened]:
     """Open an image file at a layer, by default the main image.
 
-    A HEIF is decoded when it is opened, if it has at most `limit_px` pixels and fits the memory budget.
+    A HEIF is decoded when it is opened, if it has at most `limit_px` pixels.
     Raises InputError for unknown and rare formats, camera raw files and missing layers.
     """
     if path.suffix.lower() in workarounds.RAW_SUFFIXES:
         raise InputError(f"{path}: {workarounds.UNDEVELOPED}")
     if form := isobmff.kind_of(path):
-        room_px = memory.left_bytes() // (LINEAR_BYTES + max(isobmff.HEIF_BYTES, kept_px))
-        is_avif, most_px = form == "avif", min(limit_px, room_px)
-        spec, decode_all = isobmff.open_avif(path) if is_avif else isobmff.open_heif(path, most_px)
+        is_avif = form == "avif"
+        spec, decode_all = isobmff.open_avif(path) if is_avif else isobmff.open_heif(path, limit_px)
         yield Opened(form, spec, *first_channels(spec), lambda first, past: decode_all()[..., first:past])
         return
     settings = oiio.ImageSpec()
@@ -288,3 +289,23 @@ def metadata_of(spec: oiio.ImageSpec) -> dict[str, Any]:
             if entry.name != "Orientation" and isinstance(entry.value, (str, int, float, tuple)):
                 attributes[entry.name] = entry.value
     return attributes
+
+
+def read_array(path: Path) -> np.ndarray:
+    """Read a NumPy array (.npy) of floats [H, W, 3] or [H, W], linear Rec.709, as [H, W, 3] float32."""
+    require_regular(path, "specify an image as .npy")
+    try:
+        # memory-mapped, since a header may promise more data than exists
+        values = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError, SyntaxError, TokenError, OverflowError, TypeError) as error:
+        raise InputError(f"{path}: not an array of numbers ({error}); write it with numpy.save") from None
+    if values.ndim not in (2, 3) or values.shape[2:] not in ((), (3,)) or not math.prod(values.shape):
+        raise InputError(f"{path}: array of shape {list(values.shape)}; use [height, width, 3]")
+    if math.prod(values.shape[:2]) > PHOTO_LIMIT_PX:
+        raise InputError(f"{path}: more than {PHOTO_LIMIT_PX / 1e6:.0f} megapixels; make it smaller")
+    if values.dtype.kind != "f":
+        raise InputError(f"{path}: values of type {values.dtype}; use floats of linear light, or a PNG")
+    image = np.broadcast_to(values.reshape(*values.shape[:2], -1), (*values.shape[:2], 3)).astype(np.float32)
+    if not np.isfinite(image).all():
+        raise InputError(f"{path}: contains NaN or infinite values; replace them")
+    return image

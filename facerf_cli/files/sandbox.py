@@ -7,6 +7,7 @@ numbers. Its memory, run time and output are limited; its death is reported as a
 import importlib
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -61,16 +62,13 @@ def read_in_subprocess(
 def serve() -> None:
     """Run the reader in the child process and write its arrays to stdout."""
     _, _, module, reader, path, *limits = sys.argv
-    if sys.platform != "win32":
-        import resource
-
-        for limit, value in (
-            (resource.RLIMIT_AS, _MEMORY_BYTES),
-            (resource.RLIMIT_FSIZE, _OUTPUT_BYTES),
-            (resource.RLIMIT_CORE, 0),
-        ):
-            hard = resource.getrlimit(limit)[1]
-            resource.setrlimit(limit, (value if hard < 0 else min(value, hard), hard))
+    for limit, value in (
+        (resource.RLIMIT_AS, _MEMORY_BYTES),
+        (resource.RLIMIT_FSIZE, _OUTPUT_BYTES),
+        (resource.RLIMIT_CORE, 0),
+    ):
+        hard = resource.getrlimit(limit)[1]
+        resource.setrlimit(limit, (value if hard < 0 else min(value, hard), hard))
     try:
         arrays = getattr(importlib.import_module(module), reader)(Path(path), *map(int, limits))
         np.savez(sys.stdout.buffer, **arrays)

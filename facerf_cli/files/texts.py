@@ -164,3 +164,20 @@ def _rows_of_json(text: str) -> list[tuple[str, str, Any]]:
     if not isinstance(content, list):
         raise ValueError("neither a list nor an object")
     return [(f"light {number}", "", values) for number, values in enumerate(content)]
+
+
+def text_of_state(path: Path) -> str:
+    """Return text that changes when a file is rewritten."""
+    state = path.stat()
+    return f"{state.st_size}-{state.st_mtime_ns}"
+
+
+def is_made_from(path: Path, text: str) -> bool:
+    """Tell whether a safetensors file exists whose metadata `of` is the text."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="np") as file:
+            return bool((file.metadata() or {}).get("of") == text)
+    except (SafetensorError, OSError):
+        return False

@@ -1,21 +1,24 @@
-"""Videos read by PyAV, an extra (`facerf[video]`): frames by number, decoded in order, and their times.
+"""Videos read by PyAV, an extra (`facerf[video]`): frames in order or by number, and their times.
 
 PyAV's wheel contains FFmpeg with x264 and x265 under the GPL; facerf does not bundle it.
 """
 
 import logging
+import shutil
 from bisect import bisect_right
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
-from itertools import groupby, repeat
+from functools import cached_property
+from itertools import chain, groupby, repeat
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from facerf_cli.errors import InputError, UsageError
+from facerf_cli.errors import FacerfError, InputError, UsageError
+from facerf_cli.files.atomic import hidden_folder
 from facerf_cli.files.spaces import HDR_CURVES, space_of_codes
 from facerf_cli.image.colour import SRGB, ColourSpace
 from facerf_cli.run.logs import LOGGER_NAME
@@ -26,8 +29,8 @@ _MOST_FRAMES = 1_000_000
 _BT601, BT709, _UNKNOWN = 5, 1, 2
 _HD_LINES = 720  # from this height, videos without a stated matrix are assumed to be BT.709
 _MICROSECONDS = 1_000_000  # per second, FFmpeg's unit for whole files
-_READERS = 3  # for the key frames, the middle of each take, and all frames
-_KEPT, _BEFORE = 12, 5  # decoded frames that are kept, and how many of those that a reader skips
+_READERS = 2  # one for the key frames of each take, one for all frames
+_MOST_STORED, _REACH = 64, 4  # decoded frames on the disk; neighbours on each side that are stored with one
 
 
 @dataclass(frozen=True)
@@ -66,36 +69,24 @@ def exact(av: Any) -> int:
     return int(flags.BICUBIC | flags.ACCURATE_RND | flags.FULL_CHR_H_INT | flags.FULL_CHR_H_INP)
 
 
-@dataclass(eq=False)
-class _Reader:
-    """Pass through a video: its remaining frames, and the number of the next one."""
-
-    frames: Iterator[Any]
-    next: int = 0
-
-
 class Video:
-    """Frames of a video by number, decoded in order, without seeking.
-
-    Each of up to three readers only moves forward, and the nearest one decodes a frame. So reading the key
-    frames and then all frames of each take decodes the video at most three times. Few frames are kept in
-    memory. Raises InputError for a file that cannot be decoded.
+    """Video file, decoded in order, without seeking; raises InputError for one that cannot be decoded.
 
     Attributes:
         timing: Times of the frames, their mean rate, the timecode, and the file itself if it has sound.
+        has_hidden_alpha: True if FFmpeg does not decode its alpha (VP8 and VP9).
     """
 
     def __init__(self, path: Path) -> None:
         self._path, self._av = path, require_av(path)
         self._matrix: bytes | None = None
-        self._kept: dict[int, np.ndarray] = {}
-        self._readers: list[_Reader] = []  # least recently used first
         with self._opened() as (container, stream):
             self._is_counted = container.format.name == "avi"  # without presentation times
             self._aspect = Fraction(stream.sample_aspect_ratio or 1)
             coded = stream.codec_context
             self._codes = int(coded.color_primaries), int(coded.color_trc)
             has_sound = any(track.codec_context for track in container.streams.audio)
+            self.has_hidden_alpha = {"alpha_mode", "ALPHA_MODE"} & stream.metadata.keys() != set()
             self._pts = self._presented(container, stream)
             self.timing = self._timed(container, stream, has_sound)
 
@@ -144,31 +135,21 @@ class Video:
             log.warning("%s: unknown colour codes %d and %d; assuming sRGB", self._path, *self._codes)
         return space or SRGB
 
-    def read(self, number: int) -> np.ndarray:
-        """Return frame `number` [H, W, 3 or, with alpha, 4], upright, with square pixels, in `space`.
+    def frames(self) -> Iterator[np.ndarray]:
+        """Yield each frame as `pixels`, in order."""
+        return map(self.pixels, self.decoded())
 
-        It is uint8, or uint16 for deeper videos; the colour is not multiplied by alpha.
-        """
-        if number not in self._kept:
-            before = [reader for reader in self._readers if reader.next <= number]
-            reader = max(before, key=lambda reader: reader.next) if before else _Reader(self._decoded())
-            self._readers = [*(other for other in self._readers if other is not reader), reader][-_READERS:]
-            while reader.next <= number:
-                if (frame := next(reader.frames, None)) is None:
-                    raise InputError(f"{self._path}: ends before frame {number}; copy it again")
-                if number - reader.next < _BEFORE:
-                    self._kept[reader.next] = self._pixels(frame)
-                reader.next += 1
-            for earlier in list(self._kept)[:-_KEPT]:
-                del self._kept[earlier]
-        return self._kept[number]
-
-    def _decoded(self) -> Iterator[Any]:
+    def decoded(self) -> Iterator[Any]:
         """Decode all frames as progressive, one per time stamp."""
+        count = 0
         with self._opened() as (container, stream):
             frames = self._one_per_time(container.decode(stream))
             for _, alike in groupby(frames, lambda frame: (frame.width, frame.height, frame.format.name)):
-                yield from _progressive(self._av, alike)
+                for frame in _progressive(self._av, alike):
+                    yield frame
+                    count += 1
+        if count < len(self._pts):
+            raise InputError(f"{self._path}: ends before frame {count}; copy it again")
 
     def _one_per_time(self, frames: Iterator[Any]) -> Iterator[Any]:
         """Yield the frame of each time stamp; a later frame replaces one that was not decoded."""
@@ -181,7 +162,11 @@ class Video:
                 yield from repeat(frame, due - count)
                 count = max(count, due)
 
-    def _pixels(self, frame: Any) -> np.ndarray:
+    def pixels(self, frame: Any) -> np.ndarray:
+        """Return a decoded frame [H, W, 3 or, with alpha, 4], upright, with square pixels, in `space`.
+
+        It is uint8, or uint16 for deeper videos; the colour is not multiplied by alpha.
+        """
         width = round(frame.width * max(self._aspect, 1))
         height = round(frame.height / min(self._aspect, 1))
         if width * height > _LARGEST_PX:
@@ -203,6 +188,59 @@ class Video:
             matrix = frame.side_data.get("DISPLAYMATRIX")
             self._matrix = b"" if matrix is None else bytes(matrix)
         return _upright(values, self._matrix)
+
+
+class StoredFrames:
+    """Frames of a video by number; at most 64 are stored, without loss, in a hidden folder next to an output.
+
+    Two readers move through the video in order. So reading the key frames of each take and then all of its
+    frames decodes the video at most twice, whatever its length.
+    """
+
+    def __init__(self, video: Video, output: Path) -> None:
+        self._video, self._output, self._hidden = video, output, hidden_folder(output)
+        self._stored: dict[int, Path] = {}  # least recently used first, as the readers
+        self._readers: dict[int, Iterator[Any]] = {}  # by the number of their next frame
+
+    @cached_property
+    def _folder(self) -> Path:
+        return self._hidden.__enter__()  # removed with this object, or at the end of the process
+
+    def read(self, number: int) -> np.ndarray:
+        """Return a frame as `Video.pixels`."""
+        if number not in self._stored:
+            try:
+                self._decode(number)
+            except OSError as error:
+                raise FacerfError(f"{self._output.parent}: cannot store frames: {error.strerror}") from None
+        self._stored[number] = path = self._stored.pop(number)
+        return np.asarray(np.load(path, mmap_mode="r"))
+
+    def _decode(self, number: int) -> None:
+        """Store a frame and its neighbours."""
+        start = max((following for following in self._readers if following <= number), default=0)
+        frames = self._readers.pop(start, None) or self._video.decoded()
+        past = min(number + _REACH + 1, len(self._video.timing.times_s))
+        for at, frame in zip(range(start, past), frames, strict=False):
+            if at >= number - _REACH:
+                path = self._stored.pop(at, None)
+                self._stored[at] = path or self._saved(at, self._video.pixels(frame))
+            if len(self._stored) > _MOST_STORED:
+                self._stored.pop(next(iter(self._stored))).unlink()
+        self._readers[past] = frames
+        if len(self._readers) > _READERS:
+            del self._readers[next(iter(self._readers))]
+
+    def _saved(self, number: int, pixels: np.ndarray) -> Path:
+        """Save a frame; for the first, raise FacerfError if the disk has no room for 64."""
+        needed, folder = _MOST_STORED * pixels.nbytes, self._folder
+        if not self._stored and (free := shutil.disk_usage(folder).free) < needed:
+            raise FacerfError(
+                f"{folder.parent}: {free / 1e9:.1f} GB are free, but decoding a video needs"
+                f" {needed / 1e9:.1f} GB; remove files, or choose another -o"
+            )
+        np.save(path := folder / f"{number}.npy", pixels)
+        return path
 
 
 def _upright(values: np.ndarray, matrix: bytes) -> np.ndarray:
@@ -227,27 +265,20 @@ def _progressive(av: Any, frames: Iterator[Any]) -> Iterator[Any]:
     filter, which uses neighbouring frames and leaves progressive ones unchanged.
     """
     graph: Any = None
-    for frame in frames:
-        if graph is None and frame.interlaced_frame:
+    for frame in chain(frames, (None,)):  # None flushes the graph
+        if graph is None and frame and frame.interlaced_frame:
             graph = av.filter.Graph()
             size = {"width": frame.width, "height": frame.height}
             source = graph.add_buffer(format=frame.format, time_base=frame.time_base, **size)
             bwdif = graph.add("bwdif", "mode=send_frame:deint=interlaced")
             graph.link_nodes(source, bwdif, graph.add("buffersink")).configure()
-        if graph is None:
+        if graph is not None:
+            graph.vpush(frame)
+            with suppress(BlockingIOError, EOFError):
+                while True:
+                    yield graph.vpull()
+        elif frame:
             yield frame
-        else:
-            yield from _filtered(graph, frame)
-    if graph is not None:
-        yield from _filtered(graph, None)
-
-
-def _filtered(graph: Any, frame: Any) -> Iterator[Any]:
-    """Push a frame, or None at the end, to a graph; yield the frames that are ready."""
-    graph.vpush(frame)
-    with suppress(BlockingIOError, EOFError):
-        while True:
-            yield graph.vpull()
 
 
 def start_s(container: Any) -> Fraction:
@@ -256,9 +287,11 @@ def start_s(container: Any) -> Fraction:
 
 
 def video_timing(path: Path) -> Timing:
-    """Read the timing of a video; decoding its first frame also rejects HDR."""
+    """Read the timing of a video; decoding its first frame also rejects HDR. Log alpha that is not read."""
     video = Video(path)
-    video.read(0)
+    next(video.frames())
+    if video.has_hidden_alpha:
+        log.warning("%s: alpha of VP8 and VP9 is not supported; convert it to ProRes 4444 to keep it", path)
     return video.timing
 
 

@@ -59,7 +59,7 @@ def check_writable(path: Path, source: Path) -> None:
     av, video = require_av(path), Video(source)
     try:
         with av.open(io.BytesIO(), "w", format=path.suffix[1:].lower()) as container:
-            _begin(av, container, _FORMS[path.suffix.lower()], video.read(0).shape[:2], video.timing)
+            _begin(av, container, _FORMS[path.suffix.lower()], next(video.frames()).shape[:2], video.timing)
             container.start_encoding()
     except (av.error.FFmpegError, ValueError) as error:
         raise InputError(

@@ -52,6 +52,9 @@ def refuse_rare(path: Path, form: str, spec: oiio.ImageSpec, following: oiio.Ima
     of a TIFF's second page.
     """
     meaning = spec.get_int_attribute("tiff:PhotometricInterpretation", -1)
+    is_thumbnail = spec.get_int_attribute("tiff:subfiletype", 0) & _THUMBNAIL
+    is_smaller = following is not None and 2 * spec.width <= following.width
+    is_raw = meaning in _RAW_COLOURS or is_thumbnail or is_smaller or starts_with(path, b"CR", offset=8)
     is_log = form == "cineon" or spec.get_string_attribute("dpx:Transfer") in _FILM_CURVES
     is_turned = form == "dpx" and spec.get_int_attribute("Orientation", 1) >= 5
     resources: dict[int, bytes] = {}
@@ -59,7 +62,7 @@ def refuse_rare(path: Path, form: str, spec: oiio.ImageSpec, following: oiio.Ima
         resources = by_pillow(path, lambda image: {number: data for number, _, data in image.resources}) or {}
     for is_rare, message in (
         (spec.deep, "deep data is not supported; flatten it with oiiotool --flatten"),
-        (form == "tiff" and _is_raw(path, spec, following), UNDEVELOPED),
+        (form == "tiff" and is_raw, UNDEVELOPED),
         (meaning == _WHITE_IS_ZERO, "TIFF with white as zero is not supported; save it as PNG"),
         (meaning == _CIELAB, "TIFF in CIELAB is not supported; convert it to RGB"),
         (
@@ -77,14 +80,6 @@ def has_inks(spec: oiio.ImageSpec) -> bool:
     """Return whether a JPEG or TIFF is CMYK."""
     is_separated = spec.get_int_attribute("tiff:PhotometricInterpretation", -1) == _SEPARATED
     return is_separated or spec.get_string_attribute("jpeg:ColorSpace") in ("CMYK", "YCbCrK")
-
-
-def _is_raw(path: Path, spec: oiio.ImageSpec, following: oiio.ImageSpec | None) -> bool:
-    """Return whether a TIFF contains sensor values, or a thumbnail in front of its image."""
-    is_thumbnail = bool(spec.get_int_attribute("tiff:subfiletype", 0) & _THUMBNAIL)
-    is_smaller = following is not None and 2 * spec.width <= following.width
-    colours = spec.get_int_attribute("tiff:PhotometricInterpretation", -1)
-    return starts_with(path, b"CR", 8) or is_thumbnail or is_smaller or colours in _RAW_COLOURS
 
 
 def starts_with(path: Path, start: bytes, offset: int = 0) -> bool:
@@ -158,17 +153,16 @@ def radiance_exposure(path: Path, spec: oiio.ImageSpec) -> float:
         start = stream.read(_HEADER_BYTES)
     header, _, rest = start.partition(b"\n\n")
     resolution, _, values = rest.partition(b"\n")
-    exposure, primaries, is_corrected = 1.0, list[float](), False
+    lines = re.findall(
+        r"^\s*(EXPOSURE|PRIMARIES|COLORCORR|PIXASPECT)\s*=(.*)$", header.decode("latin-1"), re.M
+    )
     try:
-        for name, text in re.findall(r"^\s*(\w+)\s*=(.*)$", header.decode("latin-1"), re.MULTILINE):
-            if name == "EXPOSURE":
-                exposure *= float(text)
-            elif name == "PRIMARIES":
-                primaries = [float(word) for word in text.split()]
-            elif name in ("COLORCORR", "PIXASPECT"):
-                is_corrected |= any(float(word) != 1 for word in text.split())
+        numbers = [(name, float(word)) for name, text in lines for word in text.split()]
     except ValueError:
-        exposure = math.nan
+        numbers = [("EXPOSURE", math.nan)]
+    exposure = math.prod(number for name, number in numbers if name == "EXPOSURE")
+    primaries = [number for name, number in numbers if name == "PRIMARIES"]
+    is_corrected = any(number != 1 for name, number in numbers if name in ("COLORCORR", "PIXASPECT"))
     stored = path.stat().st_size - (len(start) - len(values))
     has_runs = values.startswith(b"\2\2" + (spec.width & 0xFFFF).to_bytes(2, "big"))
     for is_rare, message in (

@@ -246,10 +246,12 @@ def _cannot_convert(space: ColourSpace) -> UsageError:
     )
 
 
-def in_blocks(curve: Callable[[np.ndarray], np.ndarray], pixels: np.ndarray) -> np.ndarray:
+def in_blocks(
+    curve: Callable[[np.ndarray], np.ndarray], pixels: np.ndarray, kind: type = np.float32
+) -> np.ndarray:
     """Apply a curve to [H, W, C] in blocks of rows that fit the cache, which is several times faster."""
     rows = max(1, _BLOCK_VALUES // max(1, pixels[0].size))
-    result = np.empty(pixels.shape, np.float32)
+    result: np.ndarray = np.empty(pixels.shape, kind)
     for start in range(0, len(pixels), rows):
         result[start : start + rows] = curve(pixels[start : start + rows])
     return result
@@ -324,12 +326,9 @@ def display_ev(linear: np.ndarray) -> float:
 def to_display(linear: np.ndarray, exposure_ev: float | None = None) -> np.ndarray:
     """Convert a scene-linear image [H, W, 3] to sRGB uint8, by default at the exposure `display_ev`."""
     gain = np.float32(2.0 ** (display_ev(linear) if exposure_ev is None else exposure_ev))
-    rows = max(1, _BLOCK_VALUES // max(1, linear[0].size))
-    display = np.empty(linear.shape, np.uint8)
-    for start in range(0, len(linear), rows):
-        block = slice(start, start + rows)
-        display[block] = np.round(linear_to_srgb((linear[block] * gain).clip(0, 1)) * 255)
-    return display
+    return in_blocks(
+        lambda block: np.round(linear_to_srgb((block * gain).clip(0, 1)) * 255), linear, np.uint8
+    )
 
 
 def anchored_exposure_ev(
@@ -363,7 +362,7 @@ def chosen_exposure_ev(
 
 
 def most_exposure_ev(rule: ExposureRule, strength: float) -> float:
-    """Return the largest exposure in EV under light of a total luminance (`light_weights.strengths`).
+    """Return the largest exposure in EV under light of a total luminance (`Light.strengths`).
 
     A face toward a light of strength 1 needs 0 EV for the brightness of its photo. Under `auto`, the limit
     keeps a face under rear light dark.

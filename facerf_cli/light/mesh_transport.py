@@ -259,7 +259,8 @@ class _Mesh:
 def _edges(triangles: np.ndarray, count: int) -> np.ndarray:
     """Return the edges [E, 2] of the triangles of `count` vertices, each once."""
     pairs = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    keys = np.unique(pairs[:, 0].astype(np.int64) * count + pairs[:, 1])
+    keys = np.sort(pairs[:, 0].astype(np.int64) * count + pairs[:, 1])  # faster than `np.unique`
+    keys = keys[np.diff(keys, prepend=-1) > 0]
     return np.stack([keys // count, keys % count], -1)
 
 

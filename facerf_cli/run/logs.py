@@ -1,4 +1,4 @@
-"""Log lines, JSON rows, and the provenance of outputs."""
+"""Log lines and JSON rows."""
 
 import logging
 import math
@@ -7,69 +7,16 @@ import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from facerf_cli._version import __version__
-
-# IPTC's digital source types (cv.iptc.org/newscodes/digitalsourcetype): changed by a trained model,
-COMPOSITE_SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/compositeWithTrainedAlgorithmicMedia"
-
-# computed entirely,
-COMPUTER_GRAPHICS_SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/algorithmicMedia"
-
-# and sums of photographs.
-_CAPTURES_SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/compositeCapture"
-
 # Shared by the log and the progress bars, so that they do not overwrite each other.
 STDERR = Console(stderr=True)
 LOGGER_NAME = "facerf"
-_FROM_STDIN = re.compile(r"\S*/facerf-stdin-\w+/stdin/stdin\.\w+")  # see `batch.inputs`
+_FROM_STDIN = re.compile(r"\S*/facerf-stdin-\w+/stdin/stdin(\.\w+)?")  # see `batch.inputs`
 _LONGEST_LINE = 2000  # characters of a message; those of damaged files may be of any length
-
-
-@dataclass(frozen=True)
-class Provenance:
-    """Origin of a result, for the metadata of every output.
-
-    `face_model` and its licence are `MorphableModel.stamp`; `source_type` is '' for images that are not
-    synthetic, such as a cropped photograph.
-    """
-
-    input_name: str = ""
-    checkpoint_name: str = ""
-    face_model: str = ""
-    face_model_licence: str = ""
-    source_type: str = COMPOSITE_SOURCE_TYPE
-    key: str = ""  # of the file of `-o FILE`, so that a later run recognises it
-
-    def attributes(self) -> dict[str, str | int]:
-        """Return metadata for a file's header, without empty fields."""
-        attributes: dict[str, str | int] = {
-            "Software": f"facerf {__version__}",
-            "facerf:version": __version__,
-            "facerf:synthetic": 1 if self.source_type else "",
-            "IPTC:DigitalSourceType": self.source_type,
-            "facerf:input": self.input_name,
-            "facerf:checkpoint": self.checkpoint_name,
-            "facerf:face_model": self.face_model,
-            "facerf:face_model_licence": self.face_model_licence,
-            "facerf:key": self.key,
-        }
-        return {name: value for name, value in attributes.items() if value != ""}
-
-
-def attributes_of_sum(stack: Mapping[str, Any], stack_name: str = "", key: str = "") -> dict[str, Any]:
-    """Return metadata for weighted sums of a stack's images, from the stack's metadata.
-
-    Sums of photographs are also marked as synthetic, since their light did not exist.
-    """
-    default = Provenance(stack_name, source_type=_CAPTURES_SOURCE_TYPE)
-    of_stack = {name: value for name, value in stack.items() if name != "facerf:key"}
-    return default.attributes() | of_stack | Provenance(source_type="", key=key).attributes()
 
 
 def json_line(row: Mapping[str, Any]) -> str:

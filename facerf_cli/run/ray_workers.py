@@ -1,7 +1,6 @@
 """Items as tasks of Ray, for `--ray`: on this machine's processors or a cluster's (docs/clusters.md).
 
-Ray would repeat a task itself; here the driver does, since it first looks whether the lost worker had
-finished. All machines must see the same files under the same paths.
+Ray itself repeats a task whose worker is lost. All machines must see the same files under the same paths.
 """
 
 import importlib
@@ -11,11 +10,11 @@ import queue
 import signal
 import socket
 import warnings
-from collections import deque
 from collections.abc import Callable, Generator, Sequence
 from contextlib import chdir
+from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from facerf_cli._version import __version__
 from facerf_cli.errors import FacerfError, UsageError
@@ -25,16 +24,18 @@ from facerf_cli.run.machine import processors
 T = TypeVar("T")
 R = TypeVar("R")
 _NO_MODULES = Path(__file__).parents[1] / "assets"
-_ATTEMPTS = 3  # at an item whose workers are lost
+_REPEATS = 2  # of an item whose worker is lost
 _PATIENCE_S = 10
 _STORE_BYTES = 256 << 20  # of shared memory, which only settings go through
-# Set before Ray is imported: no telemetry, a wrong address fails within half a minute, and the workers of
-# this machine have the priority that `--jobs` has (Ray's own niceness of 15 starves them beside others).
+# Set before Ray is imported: no telemetry, a wrong address fails within half a minute, a task that exceeds
+# the memory is not repeated for ever, and the workers of this machine have the priority that `--jobs` has
+# (Ray's own niceness of 15 starves them beside others).
 _ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ENABLE_METRICS_COLLECTION": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "1",
     "RAY_worker_niceness": "0",
+    "RAY_task_oom_retries": str(_REPEATS),
     "RAY_NUM_REDIS_GET_RETRIES": "2",
     "RAY_py_gcs_connect_timeout_s": "5",
 }
@@ -53,41 +54,38 @@ def in_ray(
     """Yield the number and result of each item as they come.
 
     A task has one processor, one thread and `gpus` GPUs; None: one if the cluster has any. At most `jobs`
-    tasks run at a time; 0: as many as Ray has processors. An item whose worker is lost is tried twice more.
-    Raises UsageError if Ray is not installed, or does not run at the address.
+    tasks run at a time; 0: as many as Ray has processors. Raises UsageError if Ray is not installed, or does
+    not run at the address.
     """
     ray = connect(address, jobs)
-    resources = ray.cluster_resources()
-    gpus = int(resources.get("GPU", 0) >= 1) if gpus is None else gpus
-    for name, needed in (("CPU", 1), ("GPU", gpus)):
-        if resources.get(name, 0) < needed:  # a cluster that grows may yet get it
-            log.warning("the Ray cluster has no %s now; tasks wait for one", name)
-    task = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=0)(_task)
+    gpus = int(ray.cluster_resources().get("GPU", 0) >= 1) if gpus is None else gpus
+    if ray.cluster_resources().get("GPU", 0) < gpus:  # a cluster that grows may yet get it
+        log.warning("the Ray cluster has no GPU now; tasks wait for one")
+    task = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=_REPEATS)(_task)
     environment = {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
-    shared, site = ray.put(work), _Site(os.getcwd(), __version__, log.level, environment)
-    waiting = deque((number, 1) for number in range(len(items)))
-    running: dict[Any, tuple[int, int]] = {}
+    shared = ray.put((work, os.getcwd(), __version__, log.level, environment))
+    errors, waiting, running = ray.exceptions, iter(range(len(items))), dict[Any, int]()
+    lost = (errors.WorkerCrashedError, errors.NodeDiedError, errors.OutOfMemoryError, errors.ObjectLostError)
     try:
-        while waiting or running:
-            # A cluster may grow.
-            at_once = jobs or 2 * max(1, int(ray.cluster_resources().get("CPU", 1)))
-            while waiting and len(running) < at_once:
-                number, attempt = waiting.popleft()
-                running[task.remote(shared, items[number], site)] = number, attempt
+        while True:
+            at_once = jobs or 2 * max(1, int(ray.cluster_resources().get("CPU", 1)))  # a cluster may grow
+            for number in islice(waiting, max(0, at_once - len(running))):
+                running[task.remote(shared, items[number])] = number
+            if not running:
+                return
             for reference in ray.wait(list(running), timeout=1)[0]:
-                number, attempt = running.pop(reference)
-                answer = _answer_of(ray, reference)
-                if isinstance(answer, _Answer):
-                    for record in answer.records:
-                        log.handle(record)
-                    yield number, answer.result
-                elif attempt < _ATTEMPTS:
-                    log.warning("a worker was lost; its item is tried again (%s)", answer)
-                    waiting.appendleft((number, attempt + 1))
+                number = running.pop(reference)
+                try:
+                    result, records = ray.get(reference)
+                except lost as error:
+                    yield number, died(items[number], ChildProcessError(_first_sentence(error)))
                 else:
-                    error = ChildProcessError(f"{attempt} times; the last: {answer}")
-                    yield number, died(items[number], error)
-    except ray.exceptions.RayError as error:
+                    for record in records:
+                        log.handle(record)
+                    yield number, result
+    except errors.RayTaskError as error:
+        raise error.cause from None
+    except errors.RayError as error:
         raise FacerfError(
             f"--ray {address}: the cluster was lost ({_first_sentence(error)}); start it again, then run the "
             "same command, which continues"
@@ -134,11 +132,7 @@ def _initialise(ray: Any, address: str, jobs: int) -> None:
         with chdir(_NO_MODULES):  # Ray lets workers import from the folder where it is started
             ray.init(address=address, **options)
     except (OSError, RuntimeError, ValueError, AssertionError, ray.exceptions.RayError) as error:
-        if "AF_UNIX" in str(error):
-            raise UsageError(
-                f"--ray {address}: TMPDIR has too long a name for Ray; set TMPDIR=/tmp"
-            ) from error
-        raise UsageError(f"--ray {address}: {_first_sentence(error)}") from error
+        raise UsageError(f"--ray {address}: {_first_sentence(error)}; see docs/clusters.md") from error
     finally:
         signal.signal(signal.SIGTERM, ours)  # Ray sets its own
     # A thread of Ray reports dead workers on standard output, which is for results; facerf logs them.
@@ -154,26 +148,7 @@ def _require_listener(address: str) -> None:
     try:
         socket.create_connection((host.strip("[]"), int(port)), timeout=_PATIENCE_S).close()
     except (OSError, OverflowError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise UsageError(f"--ray {address}: cannot be reached ({reason}); is Ray's head there?") from None
-
-
-def _answer_of(ray: Any, reference: Any) -> "_Answer | str":
-    """Return a task's answer, or how its worker was lost; raise the exception of the work."""
-    errors = ray.exceptions
-    lost = (errors.WorkerCrashedError, errors.NodeDiedError, errors.OutOfMemoryError, errors.ObjectLostError)
-    try:
-        return ray.get(reference)
-    except errors.RayTaskError as error:
-        if isinstance(error.cause, Exception):
-            raise error.cause from None
-        raise FacerfError(f"--ray: {_first_sentence(error)}") from error
-    except lost as error:
-        return _first_sentence(error)
-    except errors.LocalRayletDiedError:  # the node of this process
-        raise
-    except errors.RayError as error:
-        raise FacerfError(f"--ray: {_first_sentence(error)}") from error
+        raise UsageError(f"--ray {address}: cannot be reached ({error}); start Ray's head there") from None
 
 
 def _first_sentence(error: Exception) -> str:
@@ -181,32 +156,20 @@ def _first_sentence(error: Exception) -> str:
     return one_line(str(error)).split(". ")[0][:200] or type(error).__name__
 
 
-class _Site(NamedTuple):
-    """The process that sends tasks: its working folder, facerf's version, log level and variables."""
+def _task(shared: tuple[Any, ...], item: Any) -> tuple[Any, list[logging.LogRecord]]:
+    """Process one item in a worker of Ray, with the sender's working folder and variables.
 
-    folder: str
-    version: str
-    level: int
-    environment: dict[str, str]
-
-
-class _Answer(NamedTuple):
-    """The result of an item, and the log records of its work."""
-
-    result: Any
-    records: list[logging.LogRecord]
-
-
-def _task(work: Callable[[Any], Any], item: Any, site: _Site) -> _Answer:
-    """Process one item in a worker of Ray, with the sender's working folder and variables."""
+    Returns the result and the log records.
+    """
+    work, folder, version, level, environment = shared
     host = socket.gethostname()
-    if site.version != __version__:
-        raise UsageError(f"--ray: {host} has facerf {__version__}, and this is {site.version}")
-    if not Path(site.folder).is_dir():
-        raise UsageError(f"--ray: {host} has no {site.folder}; all machines must share the files")
-    os.chdir(site.folder)  # so that relative paths are the sender's
-    os.environ.update(site.environment)
+    if version != __version__:
+        raise UsageError(f"--ray: {host} has facerf {__version__}, and this is {version}")
+    if not Path(folder).is_dir():
+        raise UsageError(f"--ray: {host} has no {folder}; all machines must share the files")
+    os.chdir(folder)  # so that relative paths are the sender's
+    os.environ.update(environment)
     records: queue.SimpleQueue[logging.LogRecord] = queue.SimpleQueue()
-    log_to_queue(records, site.level)
+    log_to_queue(records, level)
     result = work(item)
-    return _Answer(result, [records.get() for _ in range(records.qsize())])
+    return result, [records.get() for _ in range(records.qsize())]

@@ -82,13 +82,31 @@ def spread(
 
 @dataclass
 class _Worker:
-    """A process, our end of its pipe, and the numbers of its items."""
+    """A process, our end of its pipe, and the numbers of its items; it processes the first one."""
 
     process: Any
     pipe: Any
-    row: deque[int]  # that it takes next
-    number: int | None = None  # that it processes
-    started: bool = False
+    row: deque[int]
+    is_ready: bool = False
+
+    def receive(self) -> tuple[str, Any]:
+        """Receive a message, or notice that the process died; FacerfError if it never started."""
+        try:
+            kind, content = self.pipe.recv()
+        except (EOFError, OSError):
+            self.process.join()
+            self.pipe.close()
+            code = self.process.exitcode
+            cause = f"exit code {code}" if code >= 0 else f"killed by {signal.Signals(-code).name}"
+            if not self.is_ready:
+                raise FacerfError(f"a worker process could not start ({cause}); try --jobs 1") from None
+            return "died", ChildProcessError(cause)
+        return kind, content
+
+    def send(self, content: Any) -> None:
+        """Send a message; `receive` notices that the process died."""
+        with suppress(BrokenPipeError, ConnectionResetError):
+            self.pipe.send(content)
 
 
 def in_processes(
@@ -103,35 +121,34 @@ def in_processes(
     numbers, length = range(len(items)), workers.in_a_row
     waiting = deque(deque(numbers[first : first + length]) for first in numbers[::length])
     running: dict[Any, _Worker] = {}
-
-    def start() -> None:
-        worker = _start_worker(workers.jobs)
-        running[worker.pipe] = worker
-
     try:
-        for _ in range(min(workers.jobs, len(waiting))):
-            start()
-        while running:
+        while waiting or running:
+            while waiting and len(running) < workers.jobs:
+                worker = _start_worker(workers.jobs, waiting.popleft())
+                running[worker.pipe] = worker
             for pipe in wait(list(running)):
                 worker = running[pipe]
-                number = worker.number
-                kind, content = _receive(worker)
+                kind, content = worker.receive()
                 if kind == "record":
                     logging.getLogger(LOGGER_NAME).handle(content)
                 elif kind == "raised":
                     raise content
-                elif kind == "died":
+                elif kind == "ready":
+                    worker.is_ready = True
+                    worker.send(work)
+                    worker.send((items[worker.row[0]],))
+                elif kind == "result":
+                    number = worker.row.popleft()
+                    if not worker.row and waiting:
+                        worker.row = waiting.popleft()
+                    worker.send((items[worker.row[0]],) if worker.row else None)
+                    yield number, content
+                else:
                     del running[pipe]
-                    if worker.row:
-                        waiting.appendleft(worker.row)
-                    if number is not None:
-                        if waiting:
-                            start()
+                    if worker.row:  # else it has ended after its last item
+                        number = worker.row.popleft()
+                        waiting.extendleft([worker.row] if worker.row else [])
                         yield number, died(items[number], content)
-                else:  # "ready" or "result"
-                    _send_next(worker, work, items, waiting)
-                    if number is not None:
-                        yield number, content
     finally:
         for worker in running.values():  # SIGTERM lets them remove temporary files
             worker.process.terminate()
@@ -142,7 +159,7 @@ def in_processes(
             worker.pipe.close()
 
 
-def _start_worker(jobs: int) -> _Worker:
+def _start_worker(jobs: int, row: deque[int]) -> _Worker:
     """Start a process, which sends "ready" when it can receive the work and items."""
     import multiprocessing
 
@@ -152,36 +169,7 @@ def _start_worker(jobs: int) -> _Worker:
     process = spawn.Process(target=_serve, args=(theirs, level, max(1, processors() // jobs)))
     process.start()
     theirs.close()  # so that the worker has the only other end, and its death closes the pipe
-    return _Worker(process, ours, deque())
-
-
-def _receive(worker: _Worker) -> tuple[str, Any]:
-    """Receive a worker's message, or notice that it died; FacerfError if it never started."""
-    try:
-        kind, content = worker.pipe.recv()
-    except (EOFError, OSError):
-        worker.process.join()
-        worker.pipe.close()
-        code = worker.process.exitcode
-        cause = f"exit code {code}" if code >= 0 else f"killed by {signal.Signals(-code).name}"
-        if worker.number is None and not worker.started:
-            raise FacerfError(f"a worker process could not start ({cause}); try --jobs 1") from None
-        return "died", ChildProcessError(cause)
-    return kind, content
-
-
-def _send_next(
-    worker: _Worker, work: Callable[[T], R], items: Sequence[T], waiting: deque[deque[int]]
-) -> None:
-    """Send a worker the next item, or None at the end."""
-    with suppress(BrokenPipeError, ConnectionResetError):  # it died; `_receive` notices
-        if not worker.started:
-            worker.pipe.send(work)
-            worker.started = True
-        if not worker.row and waiting:
-            worker.row = waiting.popleft()
-        worker.number = worker.row.popleft() if worker.row else None
-        worker.pipe.send(None if worker.number is None else (items[worker.number],))
+    return _Worker(process, ours, row)
 
 
 def _serve(pipe: Any, level: int, threads: int) -> None:

@@ -30,6 +30,7 @@ from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.synth.appearance.materials import Appearance, sample
 from facerf_cli.synth.head.body import clearance_m
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
+from facerf_cli.synth.person import SyntheticPerson
 from facerf_cli.synth.shading import (
     Material,
     Strands,
@@ -38,7 +39,6 @@ from facerf_cli.synth.shading import (
     unit_along,
     widened_lobes,
 )
-from facerf_cli.synth.subjects import Subject
 from facerf_cli.synth.views import StageCamera, facets_of, layers_of, surface_samples
 
 _BOUNCE_ORDER = 3  # of the spherical harmonics that hold bounced light
@@ -70,14 +70,14 @@ class PersonLight:
 
 
 def bake_light(
-    subject: Subject,
+    person: SyntheticPerson,
     cameras: Sequence[StageCamera],
     directions: np.ndarray,
     settings: BakeSettings,
     seed: int,
 ) -> PersonLight:
     """Bake the light of all that some cameras see of a person, from directions [L, 3] in world space."""
-    mesh = subject.mesh
+    mesh = person.mesh
     axes = np.stack([camera.head_to_camera.numpy()[2] for camera in cameras])
     transport = bake_mesh(
         mesh.vertices,
@@ -90,17 +90,17 @@ def bake_light(
         two_sided=mesh.is_part("hair"),
         clearance_m=clearance_m(mesh),
     )
-    return light_of(subject, transport)
+    return light_of(person, transport)
 
 
-def light_of(subject: Subject, transport: MeshTransport) -> PersonLight:
+def light_of(person: SyntheticPerson, transport: MeshTransport) -> PersonLight:
     """Compute the irradiance of a person with two diffuse bounces, which are tinted by mean colours later."""
-    mesh = subject.mesh
+    mesh = person.mesh
     lights = torch.from_numpy(transport.directions).float()
     normals, hair = torch.from_numpy(mesh.normals).float(), torch.from_numpy(mesh.part == _HAIR)
     cosines = (normals @ lights.T).clamp_min(0)
     cosines[hair] = strand_cosines(torch.from_numpy(mesh.tangents).float()[hair], normals[hair], lights)
-    surface = sample(subject.appearance, torch.from_numpy(mesh.part), torch.from_numpy(mesh.uv).float())
+    surface = sample(person.appearance, torch.from_numpy(mesh.part), torch.from_numpy(mesh.uv).float())
     albedo = surface.albedo.mean(1).numpy()[transport.sites][:, None]
     direct = transport.visibility.T * cosines.numpy()
     radiosity = albedo * direct[transport.sites]
@@ -195,11 +195,11 @@ class BakedView:
         return cls(**tensors | in_bytes | {name: tensors[name].float() for name in _IN_HALVES})
 
 
-def view_of(subject: Subject, light: PersonLight, camera: StageCamera) -> tuple[BakedView, Material]:
+def view_of(person: SyntheticPerson, light: PersonLight, camera: StageCamera) -> tuple[BakedView, Material]:
     """Bake what one camera sees of a person whose light is known; return also the own materials [N]."""
-    mesh = subject.mesh
+    mesh = person.mesh
     samples = surface_samples(mesh, camera)
-    facets, shares, pixels = facets_of(mesh, subject.appearance, camera, samples)
+    facets, shares, pixels = facets_of(mesh, person.appearance, camera, samples)
     rotation = camera.head_to_camera.float()
     lights = torch.from_numpy(light.directions).float() @ rotation.T
     direct, bounced = (
@@ -208,7 +208,7 @@ def view_of(subject: Subject, light: PersonLight, camera: StageCamera) -> tuple[
     bounce = bounced @ torch.linalg.pinv(sh_basis(lights, _BOUNCE_ORDER)).T
     points = torch.from_numpy(facets.corners @ mesh.vertices[facets.vertices]).float()
     classes, depth_m = layers_of(mesh, samples, camera)
-    lenses = lenses_in(subject.lenses, camera, depth_m)
+    lenses = lenses_in(person.lenses, camera, depth_m)
     view = BakedView(
         pixel=torch.from_numpy(np.repeat(pixels, np.diff(shares.indptr))).int(),
         share=torch.from_numpy(shares.data),
@@ -223,9 +223,9 @@ def view_of(subject: Subject, light: PersonLight, camera: StageCamera) -> tuple[
         bounce=bounce / facets.surface.albedo.mean().clamp_min(1e-6),
         directions=lights,
         classes=torch.from_numpy(classes),
-        landmarks_px=_landmarks_px(subject, camera),
-        rotation=rotation @ subject.head_to_world.float(),
-        scattering_m=subject.appearance.scattering_mm / 1000,
+        landmarks_px=_landmarks_px(person, camera),
+        rotation=rotation @ person.head_to_world.float(),
+        scattering_m=person.appearance.scattering_mm / 1000,
         lens_pixel=lenses.pixels.int(),
         lens_normals=lenses.normals,
         lens_views=lenses.views,
@@ -233,16 +233,16 @@ def view_of(subject: Subject, light: PersonLight, camera: StageCamera) -> tuple[
     return view, facets.surface
 
 
-def _landmarks_px(subject: Subject, camera: StageCamera) -> Tensor:
+def _landmarks_px(person: SyntheticPerson, camera: StageCamera) -> Tensor:
     """Project landmarks [68 + M, 2]; the jaw's lie on its outline, where detectors place them.
 
     The others are `MORE_LANDMARKS`; NaN for those that a person does not have.
     """
-    face = subject.face_vertices @ subject.head_to_world.T.float()
+    face = person.face_vertices @ person.head_to_world.T.float()
     face_px = project(camera.to_camera(face), camera.camera)
-    outline = silhouette_ids(face_px[None], (camera.head_to_camera @ subject.head_to_world)[None])[0]
-    more = [subject.more_landmarks_world.get(name, _MISSING) for name in MORE_LANDMARKS]
-    points = torch.from_numpy(np.concatenate([subject.landmarks_world, more])).float()
+    outline = silhouette_ids(face_px[None], (camera.head_to_camera @ person.head_to_world)[None])[0]
+    more = [person.more_landmarks_world.get(name, _MISSING) for name in MORE_LANDMARKS]
+    points = torch.from_numpy(np.concatenate([person.landmarks_world, more])).float()
     landmarks_px = project(camera.to_camera(points), camera.camera)
     landmarks_px[list(CONTOUR)] = face_px[outline[::RAYS_PER_LANDMARK]]
     return landmarks_px

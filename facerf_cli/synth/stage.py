@@ -14,15 +14,15 @@ from facerf_cli.capture.stage_json import STAGE_FILE, STAGE_FORMAT
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import write_document
+from facerf_cli.files.image_metadata import COMPUTER_GRAPHICS_SOURCE_TYPE, Provenance
 from facerf_cli.files.texts import read_json
 from facerf_cli.files.write import write_exr
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
-from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE, Provenance
 from facerf_cli.synth.bank.heads import cached_face_model
+from facerf_cli.synth.person import SyntheticPerson
 from facerf_cli.synth.renderer import bake_light, images_under, view_of
 from facerf_cli.synth.stage_settings import StageSettings
-from facerf_cli.synth.subjects import Subject
 from facerf_cli.synth.views import StageCamera, stage_cameras
 
 _BAKE = BakeSettings()
@@ -97,7 +97,7 @@ def close_capture(folder: Path, settings: StageSettings) -> None:
     write_document(folder / STAGE_FILE, describe_stage(settings) | {"subjects": subjects})
 
 
-def photograph_subject(subject: Subject, settings: StageSettings) -> Iterator[Tensor]:
+def photograph_subject(subject: SyntheticPerson, settings: StageSettings) -> Iterator[Tensor]:
     """Render linear images [L, 3, H, W], one camera at a time."""
     cameras = _cameras(settings)
     light = bake_light(subject, cameras, light_directions(settings), _BAKE, settings.seed)
@@ -106,7 +106,7 @@ def photograph_subject(subject: Subject, settings: StageSettings) -> Iterator[Te
         yield images_under(*view_of(subject, light, camera), single)
 
 
-def write_subject(folder: Path, subject: Subject, settings: StageSettings) -> None:
+def write_subject(folder: Path, subject: SyntheticPerson, settings: StageSettings) -> None:
     """Write `folder`/CAMERA/LIGHT.exr and subject.json atomically."""
     model = cached_face_model(settings.face_model)
     metadata = Provenance(**model.stamp, source_type=COMPUTER_GRAPHICS_SOURCE_TYPE).attributes()

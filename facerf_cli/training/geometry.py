@@ -18,7 +18,7 @@ from facerf_cli.face.topology import CONTOUR, OUTER_EYE_CORNERS
 from facerf_cli.network.batch import concatenate
 from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometryNetworkSettings
 from facerf_cli.raster.camera import crop_camera, project
-from facerf_cli.synth.bank.face_crops import FaceCrops, RenderedFaces
+from facerf_cli.synth.bank.geometry_crops import GeometryCrops, GeometryPhotos
 from facerf_cli.training.objective import (
     FOUND_COLOUR,
     TRUE_COLOUR,
@@ -57,7 +57,7 @@ class GeometryObjective(PeopleObjective):
 
     def __init__(
         self,
-        faces: RenderedFaces,
+        faces: GeometryPhotos,
         network: GeometryNetwork | None = None,
         settings: GeometryObjectiveSettings = GeometryObjectiveSettings(),
     ) -> None:
@@ -73,11 +73,11 @@ class GeometryObjective(PeopleObjective):
         self.register_buffer("identity_m", points[1][: own.identity])
         self.register_buffer("expression_m", points[2][: own.expression])
 
-    def draw_person(self, person: int, generator: torch.Generator) -> FaceCrops:
-        crops: FaceCrops = self.source.draw(person, self.side, generator)
+    def draw_person(self, person: int, generator: torch.Generator) -> GeometryCrops:
+        crops: GeometryCrops = self.source.draw(person, self.side, generator)
         return crops
 
-    def forward(self, batch: FaceCrops) -> dict[str, Tensor]:
+    def forward(self, batch: GeometryCrops) -> dict[str, Tensor]:
         """Compute the weighted terms, each a mean over faces."""
         with self.mixed_precision():
             estimate = GeometryEstimate(*(x.float() for x in self.network(batch.crops)))
@@ -105,7 +105,7 @@ class GeometryObjective(PeopleObjective):
         in_camera = (self.mean_m + offset) @ estimate.rotation.mT + estimate.translation_m[:, None]
         return project(in_camera, crop_camera(side))
 
-    def distances_iod(self, estimate: GeometryEstimate, batch: FaceCrops) -> Tensor:
+    def distances_iod(self, estimate: GeometryEstimate, batch: GeometryCrops) -> Tensor:
         """Return distances [B, 68] to the true landmarks over the mean face's inter-ocular distance there.
 
         The eyes of a turned head are close together in the image; their distance would give it more weight.
@@ -137,7 +137,7 @@ class GeometryObjective(PeopleObjective):
         }
         return Validation(metrics, self._sheet(batch, estimate))
 
-    def _sheet(self, batch: FaceCrops, estimate: GeometryEstimate) -> np.ndarray:
+    def _sheet(self, batch: GeometryCrops, estimate: GeometryEstimate) -> np.ndarray:
         """Draw held-out crops with the true landmarks in green and the estimated ones in red."""
         side, count, size = batch.crops.shape[-1], _SHEET_ROWS * _SHEET_COLUMNS, _SHEET_PX
         images = nn.functional.interpolate(batch.crops[:count].cpu(), (size, size), mode="nearest")
@@ -153,7 +153,7 @@ def build(run: Run) -> Objective:
     """Make the objective of the stage; bake synthetic people that are missing."""
     held_out = run.sizes.held_out_people
     folder, provenance = run.bake_people(held_out, with_squares=False)
-    faces = RenderedFaces(folder, run.backgrounds(run.bank), provenance)
+    faces = GeometryPhotos(folder, run.backgrounds(run.bank), provenance)
     settings = GeometryObjectiveSettings(held_out_people=held_out)
     network = run.geometry(faces.mean_translation_m())
     objective: Objective = run.objective(GeometryObjective)(faces, network, settings)

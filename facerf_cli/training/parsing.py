@@ -18,7 +18,7 @@ from facerf_cli.image.colour import srgb_to_linear
 from facerf_cli.network.batch import concatenate
 from facerf_cli.network.parsing import Parsing, ParsingNetwork
 from facerf_cli.portrait.parse import CLASSES
-from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
+from facerf_cli.synth.bank.parsing_crops import ParsingCrops, ParsingPhotos
 from facerf_cli.training.objective import (
     FOUND_COLOUR,
     TRUE_COLOUR,
@@ -58,7 +58,7 @@ class ParsingObjective(PeopleObjective):
 
     def __init__(
         self,
-        portraits: StoredPortraits,
+        portraits: ParsingPhotos,
         network: ParsingNetwork | None = None,
         settings: ParsingObjectiveSettings = ParsingObjectiveSettings(),
     ) -> None:
@@ -68,18 +68,18 @@ class ParsingObjective(PeopleObjective):
         rarity = [settings.rare if name in _RARE else 1.0 for name in CLASSES]
         self.register_buffer("rarity", torch.tensor(rarity), persistent=False)
 
-    def draw_one(self, generator: torch.Generator) -> PortraitCrops:
+    def draw_one(self, generator: torch.Generator) -> ParsingCrops:
         return self._draw(self.people, generator)
 
-    def draw_person(self, person: int, generator: torch.Generator) -> PortraitCrops:
+    def draw_person(self, person: int, generator: torch.Generator) -> ParsingCrops:
         return self._draw([person], generator)
 
-    def _draw(self, people: Sequence[int], generator: torch.Generator) -> PortraitCrops:
+    def _draw(self, people: Sequence[int], generator: torch.Generator) -> ParsingCrops:
         """Draw a crop of one of the people."""
-        crops: PortraitCrops = self.source.draw(people, self.side, generator)
+        crops: ParsingCrops = self.source.draw(people, self.side, generator)
         return crops
 
-    def forward(self, batch: PortraitCrops) -> dict[str, Tensor]:
+    def forward(self, batch: ParsingCrops) -> dict[str, Tensor]:
         """Compute the weighted terms, each a mean over crops."""
         with self.mixed_precision():
             parsing: Parsing = self.network(batch.crops)
@@ -135,7 +135,7 @@ class ParsingObjective(PeopleObjective):
         metrics["total"] = 1 - metrics["mean_iou"] + metrics["landmarks_percent"] / 20
         return Validation(metrics, self._sheet(batch, parsing))
 
-    def _sheet(self, batch: PortraitCrops, parsing: Parsing) -> np.ndarray:
+    def _sheet(self, batch: ParsingCrops, parsing: Parsing) -> np.ndarray:
         """Draw held-out crops with true (green) and predicted (red) landmarks, and predicted classes."""
         palette = torch.from_numpy(np.random.default_rng(2).uniform(0.15, 1, (len(CLASSES), 3))).float()
         palette[0] = 0
@@ -154,7 +154,7 @@ def build(run: Run) -> Objective:
     """Make the objective of the stage; bake synthetic people that are missing."""
     held_out = run.sizes.held_out_people
     folder, provenance = run.bake_people(held_out, with_squares=False)
-    stored = StoredPortraits(folder, run.backgrounds(run.bank), provenance)
+    stored = ParsingPhotos(folder, run.backgrounds(run.bank), provenance)
     settings = ParsingObjectiveSettings(held_out_people=held_out)
     objective: Objective = run.objective(ParsingObjective)(stored, run.network("parsing"), settings)
     return objective

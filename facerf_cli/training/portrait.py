@@ -21,7 +21,7 @@ from facerf_cli.synth.bank.portrait_samples import (
     SMALL,
     PortraitSample,
     PortraitSource,
-    StoredSquares,
+    PortraitSquares,
 )
 from facerf_cli.synth.bank.proxies import add_proxies
 from facerf_cli.training.objective import Objective, PeopleObjective, Validation, seeded, tiled
@@ -204,9 +204,9 @@ def build(run: Run) -> Objective:
     return objective
 
 
-def _stored_squares(run: Run, held_out: int) -> StoredSquares:
+def _stored_squares(run: Run, held_out: int) -> PortraitSquares:
     """Open the bank of synthetic people; bake and analyse those that are missing."""
     options, backgrounds = run.options, run.backgrounds(run.bank)
     folder, provenance = run.bake_people(held_out, with_squares=True)
     add_proxies(folder, backgrounds, run.people, options.jobs, options.settings.seed)
-    return StoredSquares(folder, backgrounds, provenance)
+    return PortraitSquares(folder, backgrounds, provenance)

@@ -26,7 +26,7 @@ from facerf_cli.run.logs import LOGGER_NAME, STDERR
 from facerf_cli.run.machine import processors
 from facerf_cli.synth.bank.backgrounds import BACKGROUND_HEAPS, BACKGROUND_MAPS, load_backgrounds
 from facerf_cli.synth.bank.heads import HeadBakeSettings, add_views, bake_heads, load_bank
-from facerf_cli.synth.bank.people import TINY_BANK, PeopleBankSettings, add_people
+from facerf_cli.synth.bank.people import PHOTO_BANK, TINY_BANK, PeopleBankSettings, add_people
 from facerf_cli.synth.bank.texture_samples import SampleSource
 from facerf_cli.synth.head.mesh import MAKEHUMAN_LICENCE
 from facerf_cli.training.loop import Start, train
@@ -195,8 +195,8 @@ class Run:
             raise UsageError(f"--heads {heads}: {held_out} people are held out; use more")
         folder, models = self.bank / "people", options.heads_from.split(",")
         drawn = [load_face_model(model) for model in models]
-        settings = TINY_BANK if self.is_tiny else PeopleBankSettings()
-        settings = replace(settings, with_squares=with_squares)
+        full = PeopleBankSettings() if with_squares else PHOTO_BANK
+        settings = replace(TINY_BANK if self.is_tiny else full, with_squares=with_squares)
         add_people(folder, models, range(heads), options.jobs, options.settings.seed, settings)
         shapes = [f"the heads' shapes: {model.licence}" for model in drawn]
         return folder, {

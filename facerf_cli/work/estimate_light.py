@@ -20,6 +20,7 @@ from facerf_cli.face.crop import Crop
 from facerf_cli.face.head import Head
 from facerf_cli.face.topology import region_mask
 from facerf_cli.face.view import render_face, see_face
+from facerf_cli.files.image_metadata import Provenance
 from facerf_cli.files.light_files import LightRecord, write_light
 from facerf_cli.files.read import LinearImage
 from facerf_cli.files.sheets import labels
@@ -38,7 +39,7 @@ from facerf_cli.portrait.confidence import confidence_of
 from facerf_cli.portrait.find import NoFaceError
 from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.photo_light import Estimator, LightEstimate, estimate_light
-from facerf_cli.run.logs import LOGGER_NAME, Provenance
+from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.work.photo_options import LightOptions
 from facerf_cli.work.photos import (
     FittedFace,

@@ -13,7 +13,7 @@ from typing import Any, Literal, Self
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items, only_item
 from facerf_cli.batch.recipe import DigestOf, Recipe, recipe_of
 from facerf_cli.batch.run import Job, Outcome, run_items
-from facerf_cli.batch.settings import NOT_IN_RECIPE, BatchOptions, folder_not_file
+from facerf_cli.batch.settings import NOT_IN_RECIPE, OUTPUT, BatchOptions, folder_not_file
 from facerf_cli.errors import UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.light.entries import parse_lights
@@ -41,14 +41,7 @@ class FileOrFolder(BatchOptions):
         output: Output folder; or a file for one result of one input, chosen by its suffix.
     """
 
-    output: Path = option(
-        Path(),
-        metavar="DIR|FILE",
-        in_recipe=False,
-        flags=("--output", "-o"),
-        shown_default=False,
-        required=True,
-    )
+    output: Path = option(Path(), metavar="DIR|FILE", **OUTPUT)
 
     def of_file(self) -> Self:
         """Return the options of a run that writes only the file that `-o` names."""

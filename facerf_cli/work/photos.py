@@ -19,7 +19,8 @@ from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import Head
 from facerf_cli.face.landmarks import read_landmarks
 from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
-from facerf_cli.files.read import LinearImage, read_image
+from facerf_cli.files.image_metadata import Provenance
+from facerf_cli.files.read import LinearImage, read_array, read_image
 from facerf_cli.image.colour import named_space, to_display
 from facerf_cli.image.strips import resized
 from facerf_cli.network.files import serving_files
@@ -33,7 +34,7 @@ from facerf_cli.relighting.fitting import head_of
 from facerf_cli.relighting.memory import KEPT_PX, beside
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.relighting.portrait_field import SmoothedFrame
-from facerf_cli.run.logs import LOGGER_NAME, Provenance, step
+from facerf_cli.run.logs import LOGGER_NAME, step
 from facerf_cli.run.threads import compute_apart
 from facerf_cli.work.photo_options import PhotoOptions, parse_pose
 
@@ -309,8 +310,6 @@ def read_normals(item: Item, file: Path | None, size_px: tuple[int, ...]) -> np.
     path = companion(item, file, "--normals-from")
     with beside(size_px, images=1):
         if path.suffix.lower() == ".npy":
-            from facerf_cli.files.arrays import read_array
-
             normals = read_array(path)
         else:
             normals = read_image(path, "linear", non_finite="zero", with_alpha=False).pixels

@@ -15,7 +15,7 @@ from facerf_cli.batch.recipe import recipe_of
 from facerf_cli.batch.run import Outcome
 from facerf_cli.errors import InputError
 from facerf_cli.face.view import photo_camera
-from facerf_cli.files.image_metadata import plate_metadata
+from facerf_cli.files.image_metadata import attributes_of_sum, plate_metadata
 from facerf_cli.files.outputs import OutputImage, write_output
 from facerf_cli.files.read import LinearImage, read_image
 from facerf_cli.files.texts import file_sha256
@@ -38,7 +38,7 @@ from facerf_cli.raster.camera import Camera, rays_of_rows
 from facerf_cli.relighting.memory import beside, beside_people, canvas, require_face, require_people
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.relightable import Relightable, RenderRequest
-from facerf_cli.run.logs import LOGGER_NAME, attributes_of_sum, json_line, step
+from facerf_cli.run.logs import LOGGER_NAME, json_line, step
 from facerf_cli.run.memory import batches
 from facerf_cli.work.photos import (
     FittedFace,

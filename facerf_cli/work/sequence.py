@@ -14,7 +14,7 @@ from facerf_cli.batch.inputs import Item
 from facerf_cli.errors import InputError
 from facerf_cli.face.landmarks import read_landmarks
 from facerf_cli.files.read import LinearImage
-from facerf_cli.files.video import Video
+from facerf_cli.files.video import StoredFrames, Video
 from facerf_cli.image.colour import SRGB, named_space, to_display, to_linear_rec709, unit_floats
 from facerf_cli.portrait.find import face_at, face_with
 from facerf_cli.portrait.segment import Segmentation
@@ -46,8 +46,9 @@ class ShotFrames:
 
     def __init__(self, shot: Shot, options: PhotoOptions) -> None:
         self._shot, self._options = shot, options
-        self._video = Video(shot.video) if shot.video else None
-        stated = self._video.space if self._video else SRGB
+        self._video = video = Video(shot.video) if shot.video else None
+        self._stored = StoredFrames(video, shot.base) if video else None
+        stated = video.space if video else SRGB
         space = options.colourspace
         self._space = stated if space is None else named_space(space, options.ocio_config)
 
@@ -60,7 +61,7 @@ class ShotFrames:
     @cached_property
     def _has_alpha(self) -> bool:
         """True if a frame has alpha that is not 0; reads all frames once."""
-        alphas = (self.read(number).alpha for number in range(len(self._shot.frames)))
+        alphas = (image.alpha for image in self.all())
         has_alpha = any(alpha is not None and alpha.any() for alpha in alphas)
         if not has_alpha:
             log.warning("%s: transparent in every frame; ignoring its alpha", self._shot.base.name)
@@ -68,9 +69,17 @@ class ShotFrames:
 
     def read(self, number: int) -> LinearImage:
         """Read a frame with its alpha."""
-        if self._video is None:
+        if self._stored is None:
             return read_photo(self._shot.frames[number], self._options, in_shot=True)
-        values = self._video.read(number)
+        return self._linear(self._stored.read(number))
+
+    def all(self) -> Iterator[LinearImage]:
+        """Read all frames in order."""
+        if self._video is None:
+            return map(self.read, range(len(self._shot.frames)))
+        return map(self._linear, self._video.frames())
+
+    def _linear(self, values: np.ndarray) -> LinearImage:
         pixels = np.ascontiguousarray(to_linear_rec709(values[..., :3], self._space), np.float32)
         alpha = unit_floats(values[..., 3]) if values.shape[2] == 4 else None
         return LinearImage(pixels, alpha, self._space.name)
@@ -81,8 +90,8 @@ class ShotFrames:
 
     def pixels(self, number: int) -> np.ndarray:
         """Return a frame's pixels [H, W, 3]; raise InputError if its size differs from the first frame's."""
-        pixels = self.read(number).pixels
-        if pixels.shape != self._shape:
+        shape, pixels = self._shape, self.read(number).pixels  # in this order: videos are decoded forward
+        if pixels.shape != shape:
             raise InputError("size differs from the first frame; use frames of equal size")
         return pixels
 
@@ -114,7 +123,7 @@ def _tracked_rows(shot: Shot, options: PhotoOptions) -> Iterator[dict[str, Any]]
     networks, settings = load_models_once(options).networks.people, options.settings
     frames, count = ShotFrames(shot, options), len(shot.frames)
     log.info("%s: tracking the face through %d frames", shot.base.name, count)
-    images = with_cuts(to_display(frames.read(number).pixels) for number in range(count))
+    images = with_cuts(to_display(image.pixels) for image in frames.all())
     hidden = not STDERR.is_terminal or settings.verbosity < 0 or settings.log_json
     with_bar = track(images, "face", count, console=STDERR, disable=hidden, transient=True)
     tracker = FaceTracker(networks, options.face)

@@ -3,6 +3,7 @@
 import hashlib
 import logging
 import re
+import shutil
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -23,9 +24,9 @@ from facerf_cli.batch.inputs import (
 )
 from facerf_cli.batch.journal import Journal
 from facerf_cli.batch.recipe import DigestOf, Recipe, RecipesOf, key_of
-from facerf_cli.batch.run import keep_newer
 from facerf_cli.batch.settings import BatchOptions, folder_not_file
 from facerf_cli.errors import InputError, UsageError
+from facerf_cli.files.atomic import is_temporary
 from facerf_cli.files.output_options import Format
 from facerf_cli.option import BATCH, option
 from facerf_cli.run.logs import LOGGER_NAME, named
@@ -247,8 +248,6 @@ class VideoOutput:
         recipe = key_of({"video": recipes_of(journal.digest_of), "inputs": inputs, "rate": str(self.rate)})
         if not journal.to_make(items[0], [self.path], [recipe], batch.overwrite):
             log.info("%s: up to date", self.path)
-            if batch.overwrite == "changed" and not batch.dry_run:
-                keep_newer([self.path], [item.input_path for item in items])
             return ""
         if batch.dry_run:
             print(named(f"{items[0].input_path} -> {self.path}"))
@@ -270,25 +269,25 @@ class VideoOutput:
                 "%s: not written because frames failed; the others remain in %s", self.path, self.folder
             )
             return 1
-        from facerf_cli.files.video import Timing, video_timing
+        from facerf_cli.files.image_metadata import Provenance
+        from facerf_cli.files.video import Timing, Video
         from facerf_cli.files.video_writer import write_video
-        from facerf_cli.run.logs import Provenance
 
         source = shots[0].video if shots else None
-        timing = video_timing(source) if source else Timing.steady(len(images), *_stated(items[0], self.rate))
+        timing = Video(source).timing if source else Timing.steady(len(images), *_stated(items[0], self.rate))
         facts = Provenance(source.name if source else "").attributes()
         provenance = "; ".join(f"{name}={value}" for name, value in facts.items())
         key = self._journal.key_of(items[0], recipe)
         comment = f"Synthetic: relit by a trained model; {provenance}; facerf:key={key}"
         write_video(self.path, images, timing, comment)
-        self._journal.add_file(items[0], self.path, recipe)
+        self._journal.add_file(self.path, items[0], recipe)
         frames = Journal(self.folder, "relight")
         edited = {path for path in images if frames.refusal(path)}
         records = () if edited else (*(shot.track for shot in shots), *self.folder.glob(".facerf*.jsonl"))
         for path in (*(path for path in images if path not in edited), *records):
             path.unlink(missing_ok=True)
-        if not any(self.folder.iterdir()):
-            self.folder.rmdir()
+        if all(map(is_temporary, self.folder.iterdir())):  # decoded frames
+            shutil.rmtree(self.folder)
         print(self.path)
         return 0
 

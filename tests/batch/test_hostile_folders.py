@@ -2,7 +2,6 @@
 
 import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -10,20 +9,19 @@ import pytest
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, NamePattern, collect_items
 from facerf_cli.batch.run import _exist, print_path
-from facerf_cli.errors import InputError
+from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.fit import load_fit
 from facerf_cli.face.landmarks import read_landmarks
-from facerf_cli.files.arrays import read_array
 from facerf_cli.files.olat_stack import is_olat_stack
-from facerf_cli.files.read import decode
+from facerf_cli.files.read import decode, read_array
 from facerf_cli.files.texts import is_regular, read_light_list, read_toml, require_regular
 from facerf_cli.run.logs import json_line, printable_line
-from tests.batch.toy_batch import run
+from tests.batch.toy_batch import run, started
 from tests.folders import rows
 from tests.kinds import Patch, Said
+from tests.refusals import refused
 from tests.stacks import read_olat_stack
 
-ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
 HOSTILE = (
     "two\nlines",
     "\x1b[31mred",
@@ -103,24 +101,13 @@ def test_a_pipe_in_a_folder_costs_its_own_item(tmp_path: Path) -> None:
 def test_an_output_folder_that_is_a_link_in_a_circle_is_refused(tmp_path: Path) -> None:
     photos = photos_of(tmp_path / "in", "a")
     (tmp_path / "out").symlink_to(tmp_path / "out")
-    command = "from pathlib import Path; from tests.batch.toy_batch import run; import sys\n"
-    command += "run(Path(sys.argv[1]), Path(sys.argv[2]))"
-    ended = subprocess.run(
-        [sys.executable, "-c", command, str(photos), str(tmp_path / "out")],
-        env=ENVIRONMENT,
-        capture_output=True,
-        text=True,
-    )
-    assert "UsageError" in ended.stderr and "RuntimeError" not in ended.stderr
+    refused(UsageError, f"-o {tmp_path / 'out'}: cannot be written to", run, photos, tmp_path / "out")
 
 
 def test_two_processes_in_a_folder_share_its_report(tmp_path: Path) -> None:
     photos = photos_of(tmp_path / "in", *map(str, range(20)))
-    command = "from pathlib import Path; from tests.batch.toy_batch import run; import sys\n"
-    command += "sys.exit(run(Path(sys.argv[1]), Path(sys.argv[2])))"
-    line = [sys.executable, "-c", command, str(photos), str(tmp_path / "out")]
-    both = [subprocess.Popen(line, env=ENVIRONMENT, stderr=subprocess.DEVNULL) for _ in range(2)]
-    assert [process.wait() for process in both] == [0, 0]
+    both = [started(photos, tmp_path / "out") for _ in range(2)]
+    assert [process.communicate() and process.returncode for process in both] == [0, 0]
     assert sorted(map(int, rows(tmp_path / "out"))) == list(range(20))
     assert len((tmp_path / "written").read_text().split()) == 20  # each once
 

@@ -132,43 +132,28 @@ def test_lists_on_stdin_end_in_lines_or_nul(photos: Path, tmp_path: Path, monkey
 
 
 @pytest.mark.parametrize(
-    ("start", "suffix"),
+    "start",
     [
-        (b"\x89PNG\r\n\x1a\n", ".png"),
-        (b"\xff\xd8\xff\xe1", ".jpg"),
-        (b"II*\0\x08\0\0\0", ".tif"),
-        (b"MM\0*\0\0\0\x08", ".tif"),
-        (b"MM\0+\0\x08\0\0", ".tif"),
-        (b"v/1\x01\x02\0\0\0", ".exr"),
-        (b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n", ".hdr"),
-        (b"RIFF\x24\n\0\0WEBPVP8 ", ".webp"),
-        (b"\xff\x0a\xfa\x1f", ".jxl"),
-        (b"\0\0\0\x0cJXL \r\n\x87\n", ".jxl"),
-        (b"\0\0\0\x24ftypheic\0\0\0\0mif1", ".heic"),
-        (b"\0\0\0\x0aftypmif1\0\0\0\0mif1", ".heic"),
-        (b"\0\0\0\x20ftypavif\0\0\0\0avif", ".avif"),
-        (b"\0\0\0\x0cjP  \r\n\x87\n", ".jp2"),
-        (b"8BPS\0\x01\0\0\0\0\0\0\0\x03", ".psd"),
-        (b"SDPX\0\0\x20\0V1.0", ".dpx"),
-        (b"XPDS\0\x20\0\0V1.0", ".dpx"),
-        (b"\x80*_\xd7\0\0\x08\0", ".cin"),
-        (b"BM\x36\x0a\0\0\0\0\0\0\x36", ".bmp"),
-        (b"GIF89a\x2c\x01", ".gif"),
-        (b"P6\n# by hand\n# twice 2\n4 3\n255\n\0", ".ppm"),
-        (b"P5 4 3 65535 \0", ".ppm"),
+        b"\x89PNG\r\n\x1a\n",
+        b"MM\0+\0\x08\0\0",
+        b"v/1\x01\x02\0\0\0",
+        b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 1 +X 9\n\2\2\0\x09",
+        b"\0\0\0\x18ftypheic\0\0\0\0mif1",
+        b"P6\n# by hand\n40 30\n255\n" + b"\xff" * 5000,
+        b"P3 4 3 255 9 9 9",
     ],
 )
-def test_the_first_bytes_tell_an_image_on_stdin(start: bytes, suffix: str, monkeypatch: Patch) -> None:
+@pytest.mark.parametrize("null_separated", [False, True])
+def test_an_image_on_stdin_is_copied(start: bytes, null_separated: bool, monkeypatch: Patch) -> None:
     pipe(monkeypatch, start + bytes(5000))
-    (path,) = map(Path, expand_inputs(["-"]))
-    assert path.name == f"stdin{suffix}" and path.read_bytes() == start + bytes(5000)
+    (path,) = map(Path, expand_inputs(["-"], null_separated))
+    assert path.stem == "stdin" and path.read_bytes() == start + bytes(5000)
+    assert path.suffix == (".exr" if start.startswith(b"v/1") else "")
 
 
 @pytest.mark.parametrize(
     ("content", "null_separated"),
     [
-        (b"\0\0\0\x20ftypisom" + bytes(range(256)) * 40, False),  # a video
-        (b"\x1aE\xdf\xa3\x01" + bytes(range(256)) * 40, True),
         (b"".join(bytes([n, n + 1, 10]) for n in range(128, 250)), False),
         (b"# Title\n\nSome text\n.\n" + b"- more\n" * 20, False),
         ("a.png\nb.jpg\n".encode("utf-16"), False),
@@ -187,10 +172,17 @@ def test_what_is_neither_an_image_nor_a_list_costs_a_line(
     assert "standard input is neither an image nor a list" in line and len(line) < 500
 
 
+def test_a_video_on_stdin_is_no_image(tmp_path: Path, monkeypatch: Patch, capsys: Said) -> None:
+    pipe(monkeypatch, b"\0\0\0\x20ftypisom" + bytes(range(256)) * 40)
+    assert main(["segment", "-", "-o", str(tmp_path / "out")]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("facerf: error: -: ")
+
+
 def test_what_stdin_may_hold_is_bounded(monkeypatch: Patch) -> None:
     monkeypatch.setattr(inputs_module, "_MOST_LIST_BYTES", 5000)
     monkeypatch.setattr(inputs_module, "_MOST_IMAGE_BYTES", 12000)
-    for content, said in ((b"\x89PNG" + bytes(20000), "more than 1 GiB"), (b"x" * 5001, "neither")):
+    for content, said in ((b"\x89PNG\x1a" + bytes(20000), "more than 1 GiB"), (b".\n" * 2501, "neither")):
         pipe(monkeypatch, content)
         with pytest.raises(UsageError, match=said):
             list(expand_inputs(["-"]))
@@ -210,14 +202,14 @@ def test_an_image_on_stdin_is_not_named_by_its_temporary_file(
         lines = streams.out + streams.err
         assert said in lines and str(temporary) not in lines
     for _ in range(2):
-        pipe(monkeypatch, b"\x89PNG of toys")
+        pipe(monkeypatch, b"\x89PNG\x1a of toys")
         assert toy_batch.run(Path("-"), out) == 0
         assert (tmp_path / "written").read_text() == "stdin\n"
     assert "finished and kept" in capsys.readouterr().err
     rows = rows_of(out).values()
     assert {(row["item"], row["input"]) for row in rows} == {("stdin", "-")}
-    pipe(monkeypatch, b"\x89PNG")
-    assert names(tmp_path, Path("-"), pattern="{parent}-{stem}-{ext}") == ["stdin-stdin-png"]
+    pipe(monkeypatch, b"\x89PNG\x1a")
+    assert names(tmp_path, Path("-"), pattern="{parent}-{stem}-{ext}") == ["stdin-stdin"]
 
 
 @pytest.mark.parametrize("unwinds", [True, False])
@@ -239,9 +231,9 @@ def test_an_image_on_stdin_goes_with_its_process(tmp_path: Path, unwinds: bool) 
     settings = {**os.environ, "TMPDIR": str(tmp_path)}
     with subprocess.Popen(command, env=settings, stdin=PIPE, stdout=PIPE) as process:
         assert process.stdin and process.stdout
-        process.stdin.write(b"\x89PNG")
+        process.stdin.write(b"\x89PNG\x1a")
         process.stdin.close()
-        assert Path(process.stdout.readline().decode().strip()).read_bytes() == b"\x89PNG"
+        assert Path(process.stdout.readline().decode().strip()).read_bytes() == b"\x89PNG\x1a"
         process.terminate()
     assert process.returncode == 143 and not list(tmp_path.iterdir())
 

@@ -1,6 +1,5 @@
 """`--shard` and `--ray` on the command line, and what shards leave: reports of their own, one summary."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,8 +13,6 @@ from facerf_cli import main
 from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.run import sums_up
 from facerf_cli.batch.settings import BatchOptions, Settings, Shard, default_job_count, torch_device
-from facerf_cli.cli.help import Verb
-from facerf_cli.cli.options import with_groups
 from facerf_cli.errors import UsageError
 from facerf_cli.run import ray_workers
 from facerf_cli.run.logs import configure_logging
@@ -29,7 +26,6 @@ FOLDER_VERBS = {
     "prepare-dataset", "relight-dataset", "evaluate olat", "evaluate reconstruction", "evaluate transfer",
     "evaluate geometry", "evaluate yale-b", "evaluate cases", "evaluate compare", "segment", "view",
 }  # fmt: skip
-Call = Callable[..., BatchOptions]
 
 
 def test_every_verb_that_walks_folders_has_both() -> None:
@@ -44,27 +40,11 @@ def test_every_verb_that_walks_folders_has_both() -> None:
     ]
 
 
-@pytest.fixture
-def call() -> Call:
-    """Runs a line of a verb that walks nothing; gives the options of its batch."""
-    got: list[BatchOptions] = []
-
-    def walk(batch: BatchOptions) -> None:
-        got.append(batch)
-
-    app = typer.Typer()
-    app.callback()(main._global_options)
-    app.command(cls=Verb)(with_groups(walk))
-    return lambda *line: (app(args=["walk", "-o", "out", *line], standalone_mode=False), got.pop())[1]
-
-
-def test_they_reach_the_options(call: Call) -> None:
-    plain = BatchOptions(Path("out"))
-    assert call() == plain
-    assert call("--shard", "3/8", "--jobs", "2") == replace(plain, shard=Shard(3, 8), jobs=2)
-    for line, jobs in ((["--jobs", "1"], 1), ([], 0)):
-        assert call("--ray", "local", *line).workers(Settings()) == Workers(jobs, "local", None, 1)
-    assert call().workers(Settings()) == Workers(1, None, None, 1)
+def test_workers_are_those_of_the_options() -> None:
+    for jobs, expected in ((1, 1), (None, 0)):
+        options = BatchOptions(ray="local", jobs=jobs)
+        assert options.workers(Settings()) == Workers(expected, "local", None, 1)
+    assert BatchOptions().workers(Settings()) == Workers(1, None, None, 1)
 
 
 @pytest.mark.parametrize(
@@ -111,13 +91,13 @@ def test_a_folder_gets_them(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("text", ["", "1", "0/2", "3/2", "1/0", "a/b", "-1/2", "1/2/3", "1.0/2", "½/2"])
-def test_a_wrong_share(call: Call, text: str) -> None:
-    refused(UsageError, "--shard ... : not a shard; use K/N with K from 1 to N", call, f"--shard={text}")
+def test_a_wrong_share(text: str) -> None:
+    refused(UsageError, "--shard ... : not a shard; use K/N with K from 1 to N", Shard.parse, text)
 
 
 @pytest.mark.parametrize("of", [1, 2, 3, 7])
 def test_shards_share_the_items_out(of: int) -> None:
-    shares = [Shard(number, of).share(range(5)) for number in range(1, of + 1)]
+    shares = [Shard.parse(f"{number}/{of}").share(range(5)) for number in range(1, of + 1)]
     assert sorted(item for share in shares for item in share) == list(range(5))
     assert max(map(len, shares)) - min(map(len, shares)) <= 1
 

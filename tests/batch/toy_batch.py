@@ -4,6 +4,7 @@ import fcntl
 import logging
 import os
 import signal
+import subprocess
 import sys
 import time
 from dataclasses import dataclass, field
@@ -93,7 +94,17 @@ def run_job(job: Job, inputs: Path | list[Path], output: Path, **options: object
     return run_items(job, items, BatchOptions(output, **options), Settings())  # type: ignore[arg-type]
 
 
+def started(
+    inputs: Path, output: Path, jobs: int = 1, ray: str = "", **popen: object
+) -> "subprocess.Popen[str]":
+    """Start `run` in another process, whose standard error is a pipe."""
+    line = [sys.executable, "-m", "tests.batch.toy_batch", str(inputs), str(output), str(jobs), ray]
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    return subprocess.Popen(line, env=environment, stderr=subprocess.PIPE, text=True, **popen)
+
+
 if __name__ == "__main__":
     from tests.batch.toy_batch import run as run_importable
 
-    run_importable(Path(sys.argv[1]), Path(sys.argv[2]), ray="local", jobs=2)
+    inputs, output, jobs, ray = sys.argv[1:]
+    sys.exit(run_importable(Path(inputs), Path(output), ray=ray or None, jobs=int(jobs)))

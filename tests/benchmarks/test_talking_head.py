@@ -13,13 +13,13 @@ from _talking_head import Actor, seen_from, turned
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.raster.camera import rotation_to_pose
 from facerf_cli.synth.bank.heads import cached_face_model
-from facerf_cli.synth.subjects import draw_subject
+from facerf_cli.synth.person import draw_person
 from facerf_cli.synth.views import stage_cameras
 
 
 def test_the_jaw_opens_and_the_hair_stays() -> None:
     model = cached_face_model("builtin")
-    subject = draw_subject(model, 5, 101, 64)
+    subject = draw_person(model, 5, 101, 64)
     moved = Actor(subject, model).with_expression({"jaw_open": 1.0})
     offset = moved.mesh.vertices - subject.mesh.vertices
     chin = np.linalg.norm(subject.mesh.vertices - subject.landmarks_world[8], axis=1).argmin()

@@ -109,7 +109,7 @@ def draft(pattern: str, *names: str) -> Callable[[Path], Any]:
         for name in names:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             write_display(folder / name, np.full((6, 8, 3), 0.25, np.float32))
-        return draft_stage(folder, frozenset({".png"}), pattern)
+        return draft_stage(folder, pattern)
 
     return call
 
@@ -155,13 +155,13 @@ ROWS: dict[str, Callable[[Path], Any]] = {
         write_flat_stage(folder), ReadSettings(subtract_ambient=True)
     ),
     "here: no such folder": lambda folder: draft("")(folder / "here"),
-    "no images": draft("{light}.png"),
+    "matches no image": draft("{light}.png"),
     "2 lights": draft("{light}.png", "a.png", "b.png"),
     "--pattern: missing ... {light}": draft("", "L1.png"),
     "--pattern ... {light}": frames("{subject}/{camera}.exr"),
     "--pattern ... below the capture": frames("../{light}.exr"),
     "--pattern ... '{' '}'": frames("{subject}/{lamp}/{light}.exr"),
-    "--pattern ... 1/1/1.exr": frames("{subject}/{light}.exr"),
+    "--pattern ... matches no image": frames("{subject}/{light}.exr"),
     "lens.xml ... camera A has b2": lens("<k1>", "<b2>0.1</b2><k1>"),
     "lens.xml ... camera A has b2 or k4": lens("<k1>", "<k4>0.1</k4><k1>"),
     "lens.xml ... camera A ... frame camera": lens('class="adjusted"', 'type="fisheye"'),

@@ -1,4 +1,4 @@
-"""Captures on disk: axes, lamps and values become DESIGN's; whatever is wrong is said in one line."""
+"""Captures on disk: axes, lights and values become the package's; every fault is named in one line."""
 
 from pathlib import Path
 

@@ -86,9 +86,7 @@ def test_a_run_that_was_ended_before_its_sheet_is_finished(tmp_path: Path, capsy
     assert main(line) == 0
     sheet = tmp_path / "envmaps.png"
     os.utime(sheet, (0, 0))
-    left = (
-        tmp_path / f".envmaps.part-{machine_id()}-{2**22 + 1}-0123456789abcdef"
-    )  # beyond Linux's process ids
+    left = tmp_path / f".part-{machine_id()}-{2**22 + 1}-0123456789abcdef"  # beyond Linux's process ids
     left.mkdir()
     capsys.readouterr()
     assert main(line) == 0

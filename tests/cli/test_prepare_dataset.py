@@ -22,13 +22,13 @@ from facerf_cli.dataset.prepare import Preparation, _Subject
 from facerf_cli.face.fit import load_fit
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
+from facerf_cli.files.image_metadata import COMPUTER_GRAPHICS_SOURCE_TYPE
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.main import main
 from facerf_cli.network.checkpoint import load_networks, save_networks
 from facerf_cli.network.files import SHIPPED
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
-from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE
 from tests.cli.lines import prepare
 from tests.folders import rows as rows_of
 from tests.folders import tree

@@ -11,15 +11,15 @@ import pytest
 import torch
 
 from facerf_cli.capture.layouts import read_capture
+from facerf_cli.files.image_metadata import COMPUTER_GRAPHICS_SOURCE_TYPE
 from facerf_cli.files.read import read_image
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.main import main
 from facerf_cli.portrait.parse import class_index
-from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE
 from facerf_cli.synth import stage
 from facerf_cli.synth.bank.heads import cached_face_model
+from facerf_cli.synth.person import draw_person
 from facerf_cli.synth.stage_settings import Frame
-from facerf_cli.synth.subjects import draw_subject
 from facerf_cli.synth.views import layers_of, stage_cameras, surface_samples
 from tests.folders import tree
 
@@ -109,7 +109,7 @@ def test_a_dry_run_writes_nothing(tmp_path: Path, capsys: Said) -> None:
 
 
 def test_a_bust_shows_more_of_the_garment() -> None:
-    subject = draw_subject(cached_face_model("builtin"), 0, 0, 64)
+    subject = draw_person(cached_face_model("builtin"), 0, 0, 64)
     frames: tuple[Frame, Frame] = ("head", "bust")
     head, bust = (
         layers_of(subject.mesh, surface_samples(subject.mesh, camera), camera)[0]

@@ -318,27 +318,6 @@ def test_a_sequence_with_a_hole_is_said(
         assert said.out == "" and len(names(tmp_path)) == 3
 
 
-def test_a_video_of_a_sequence_has_the_rate_and_the_timecode_of_its_headers(
-    given: Path, tmp_path: Path
-) -> None:
-    for number in range(2):
-        stated: dict[str, Any] = {
-            "framesPerSecond": (24000, 1001),
-            "smpte:TimeCode": (0x01020304 + number, 0),
-        }
-        path = tmp_path / f"plates/me_{number}.exr"
-        path.parent.mkdir(exist_ok=True)
-        write_exr(path, (frame_of(number) / np.float32(255)) ** np.float32(2.2), metadata=stated)
-    line = (tmp_path / "plates", "--sequence", "--light", "70,20", *CHEAP)
-    assert facerf(given, "relight", *line, "-o", tmp_path / "me.mov") == 0
-    assert facerf(given, "relight", tmp_path / "me.mov", *line[2:], "-o", tmp_path / "again.mp4") == 0
-    for name in ("me.mov", "again.mp4"):
-        with av.open(str(tmp_path / name)) as container:
-            stream = container.streams.video[0]
-            assert stream.average_rate == Fraction(24000, 1001)
-            assert stream.metadata["timecode"] == "01:02:03:04"
-
-
 @pytest.mark.parametrize(
     ("stated", "given_rate", "timecode", "expected"),
     [
@@ -576,12 +555,3 @@ def test_options_that_a_video_cannot_have(
     assert main(["relight", *filled]) == 2
     assert message in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
-
-
-def test_a_video_in_a_folder_of_photos_is_left_alone(given: Path, tmp_path: Path, capsys: Said) -> None:
-    shutil.copy(given / "me.mp4", tmp_path / "live.mp4")
-    shutil.copy(PHOTO, tmp_path / "me.jpg")
-    assert main(["relight", str(tmp_path), "--light", "0,0", "-o", str(tmp_path / "out"), "--dry-run"]) == 0
-    assert {line.split(" -> ")[0] for line in capsys.readouterr().out.splitlines()} == {
-        str(tmp_path / "me.jpg")
-    }

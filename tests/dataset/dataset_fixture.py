@@ -21,12 +21,12 @@ from facerf_cli.face.fit import FaceFit, save_fit
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import grid_triangles, grid_uv
 from facerf_cli.files.documents import write_document
+from facerf_cli.files.image_metadata import Provenance
 from facerf_cli.files.olat_stack import write_olat_stack
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.raster.camera import crop_camera, pose_to_rotation, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture
-from facerf_cli.run.logs import Provenance
 from facerf_cli.synth.appearance.skin import draw_skin
 
 YAW_DEG = (-15.0, 20.0, 40.0, -40.0)  # of the head, one a camera: camera k sees it turned so far

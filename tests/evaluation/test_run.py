@@ -13,10 +13,11 @@ from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation import run
 from facerf_cli.evaluation.options import Measures, NamedPath
 from facerf_cli.face.morphable import load_face_model
+from facerf_cli.files.image_metadata import COMPOSITE_SOURCE_TYPE
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_exr
 from facerf_cli.main import main
-from facerf_cli.run.logs import COMPOSITE_SOURCE_TYPE, configure_logging
+from facerf_cli.run.logs import configure_logging
 from tests.evaluation.toy_protocol import (
     NOISE,
     PEOPLE,

@@ -56,15 +56,11 @@ def test_lights_add_and_maps_are_read(package: ModuleType) -> None:
 
 def test_an_image_is_relit_with_its_matte(package: ModuleType) -> None:
     nodes = package.NODE_CLASS_MAPPINGS
-    photo = torch.from_numpy(read_image(ROOT / "examples/astronaut.jpg").pixels.clip(0, 1) ** (1 / 2.2))[None]
-    results = []
-    for azimuth in (-60.0, 60.0):
-        (light,) = nodes["FacerfLight"]().make(azimuth, 10.0, 1.0, 1.0, 1.0)
-        results.append(nodes["FacerfRelight"]().relight(photo, light, 0.5))
-    (left, matte), (right, _) = results
-    assert left.shape == photo.shape and matte.shape == photo.shape[:3]
-    assert 0.2 < matte.mean() < 0.8 and left.min() >= 0 and left.max() <= 1
-    face = slice(70, 170), slice(175, 275)  # of the astronaut, whose middle is at 225
-    half = [one[0, face[0], face[1]].mean((0, 2)) for one in (left, right)]
-    assert half[0][:40].mean() > 1.5 * half[1][:40].mean()
-    assert half[1][-40:].mean() > 1.5 * half[0][-40:].mean()
+    pixels = read_image(ROOT / "examples/astronaut.jpg").pixels[::2, ::2]
+    photo = torch.from_numpy(pixels.clip(0, 1) ** (1 / 2.2))[None]
+    (light,) = nodes["FacerfLight"]().make(-60.0, 10.0, 1.0, 1.0, 1.0)
+    relit, matte = nodes["FacerfRelight"]().relight(photo, light, 0.5)
+    assert relit.shape == photo.shape and matte.shape == photo.shape[:3]
+    assert 0.2 < matte.mean() < 0.8 and relit.min() >= 0 and relit.max() <= 1
+    face = relit[0, 35:85, 88:138].mean((0, 2))  # of the astronaut, whose middle is at 113
+    assert face[:20].mean() > 1.5 * face[-20:].mean()

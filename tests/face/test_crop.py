@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.crop import Crop, check_in_photo, check_landmarks, from_box, from_landmarks
+from facerf_cli.face.crop import Crop, check_in_photo, from_box, from_landmarks
 from facerf_cli.face.topology import LANDMARKS_M
 from tests.refusals import refused
 
@@ -92,21 +92,6 @@ def test_the_crop_follows_the_face_and_that_of_a_box_is_larger():
     assert crop == Crop(150 - 74, 90 - 2 - 74, 148, 64)
     for bad in ((5.0, 0.0, 5.0, 0.0), (0.0, 0.0, np.inf, 9.0), (0.0, 0.0, np.nan, 9.0)):
         refused(InputError, "not a face box", from_box, bad, 64)
-
-
-@pytest.mark.parametrize(
-    "landmarks",
-    [
-        np.full((68, 2), 5.0),
-        np.full((68, 2), np.nan),
-        np.zeros((67, 2)),
-        np.stack([np.arange(68.0), np.arange(68.0)], -1) * [1, 0],
-        np.where(np.arange(68)[:, None] == 3, np.inf, frontal_landmarks()),
-    ],
-)
-def test_what_is_no_face_is_refused(landmarks):
-    with pytest.raises(InputError):
-        check_landmarks(landmarks)
 
 
 def test_tensors_and_crops_of_another_world_are_refused():

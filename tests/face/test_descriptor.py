@@ -1,7 +1,6 @@
 """Descriptors distinguish people and do not depend on the face's position in the image."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from facerf_cli.face.descriptor import face_descriptor
 from facerf_cli.files.read import read_image
 from facerf_cli.image.colour import to_display
 from facerf_cli.portrait.find import find_faces
-from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from tests.kinds import Patch
 from tests.refusals import refused
@@ -39,21 +37,6 @@ def test_a_face_is_its_own_whatever_its_exposure(descriptor: np.ndarray, landmar
     elsewhere = face_descriptor(PHOTO, np.add(landmarks_px, (60, 90)))
     assert np.linalg.norm(face_descriptor(darker, landmarks_px) - descriptor) < 0.2
     assert np.linalg.norm(elsewhere - descriptor) > 0.5
-
-
-def test_points_are_dlibs_whole_pixels(monkeypatch: Patch) -> None:
-    class Recorder:
-        def compute_face_descriptor(self, image: np.ndarray, shape: Any) -> list[float]:
-            self.image, self.points = image, [(point.x, point.y) for point in shape.parts()]
-            return [0.0] * 128
-
-    recorder = Recorder()
-    dlib, _ = module._recognition()
-    monkeypatch.setattr(module, "_recognition", lambda: (dlib, recorder))
-    places = np.stack([np.arange(68), 2 * np.arange(68)], -1)
-    face_descriptor(np.full((9, 7, 3), [0.2, 0.5, 1.3]), places + PIXEL_CENTRE + 0.2)
-    assert recorder.points == [tuple(place) for place in places.tolist()]  # a pixel's centre is whole there
-    assert recorder.image.dtype == np.uint8 and recorder.image[3, 3].tolist() == [51, 128, 255]
 
 
 def test_people_are_told_apart(shared_data: Path, descriptor: np.ndarray) -> None:

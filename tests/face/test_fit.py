@@ -113,7 +113,10 @@ def test_wrong_landmarks_are_not_believed_and_those_without_trust_count_for_noth
     assert torch.allclose(a.alpha, b.alpha, atol=1e-9) and torch.allclose(a.off, b.off)
 
 
-@pytest.mark.parametrize("bad", [np.full((68, 2), 7.0), np.full((68, 2), np.nan), np.zeros((5, 2))])
+ON_A_LINE = np.stack([np.arange(68.0), np.zeros(68)], -1)
+
+
+@pytest.mark.parametrize("bad", [np.full((68, 2), np.nan), np.zeros((5, 2)), ON_A_LINE])
 def test_degenerate_landmarks_are_an_input_error(model, bad):
     with pytest.raises(InputError):
         fit_landmarks(model, bad, CROP)

@@ -4,7 +4,6 @@ import re
 import struct
 import zlib
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -137,34 +136,20 @@ def _rgbe(light: np.ndarray) -> np.ndarray:
 def write_hdr(
     path: Path, light: np.ndarray, head: str = "", order: str = "-Y +X", form: str = "plain"
 ) -> Path:
-    """Rows of a Radiance file in some order of its axes, plain, or in the old or new run-length form."""
+    """Rows of a Radiance file in some order of its axes, plain or in the new run-length form."""
     first, second = order.split()
     for axis, sign in ((0, "-Y" in order), (1, "+X" in order)):
         light = light if sign else np.flip(light, axis)
     rows = _rgbe(light if first[1] == "Y" else light.swapaxes(0, 1))
     size = f"{first} {rows.shape[0]} {second} {rows.shape[1]}\n"
-    body = b"".join({"plain": bytes, "old": _old_runs, "new": _new_runs}[form](row) for row in rows)
+    body = b"".join({"plain": bytes, "new": _new_runs}[form](row) for row in rows)
     path.write_bytes(f"#?RADIANCE\n{head}FORMAT=32-bit_rle_rgbe\n\n{size}".encode() + body)
     return path
-
-
-def _old_runs(row: np.ndarray) -> bytes:
-    starts = [0, *(np.flatnonzero((np.diff(row.astype(int), axis=0) != 0).any(1)) + 1), len(row)]
-    runs = b""
-    for start, end in pairwise(starts):
-        count = end - start - 1
-        runs += bytes(row[start]) + (bytes([1, 1, 1, count & 255]) if count else b"")
-        runs += bytes([1, 1, 1, count >> 8]) if count > 255 else b""
-    return runs
 
 
 def _new_runs(row: np.ndarray) -> bytes:
     channels = b"".join(bytes([len(part)]) + bytes(part) for part in row.T)  # each is one run of literals
     return bytes([2, 2, len(row) >> 8, len(row) & 255]) + channels
-
-
-def long_runs(path: Path) -> Path:
-    return write_hdr(path, np.full((3, 700, 3), 0.25), form="old")
 
 
 def properties(data: bytes) -> dict[str, str]:

@@ -74,18 +74,16 @@ def visible(folder: Path) -> list[str]:
     return [path.name for path in folder.iterdir() if not path.name.startswith(".")]
 
 
-def test_a_file_is_fetched_once_and_again_where_it_is_damaged(server: Server, tmp_path: Path) -> None:
+def test_a_file_is_fetched_once_and_again_where_it_is_damaged(
+    server: Server, tmp_path: Path, monkeypatch: Patch
+) -> None:
     path = fetch(server.published(), OPTION, tmp_path / "new" / "cache")
     assert path == tmp_path / "new" / "cache" / "a file.pth" and path.read_bytes() == CONTENT
     assert visible(path.parent) == ["a file.pth"]
     assert fetch(server.published(), OPTION, path.parent) == path and server.asked == 2
     (tmp_path / "a file.pth").write_bytes(CONTENT[:-1] + b"!")
-    assert fetch(server.published(), OPTION, tmp_path).read_bytes() == CONTENT
-
-
-def test_the_default_place_is_the_users_cache(server: Server, tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.setattr(downloads, "cache_folder", lambda: tmp_path)
-    assert fetch(server.published(), OPTION).parent == tmp_path
+    assert fetch(server.published(), OPTION).read_bytes() == CONTENT  # in the user's cache
 
 
 def test_a_cut_connection_leaves_nothing(server: Server, tmp_path: Path) -> None:
@@ -114,12 +112,8 @@ def test_more_than_the_file_can_be_is_not_taken(server: Server, tmp_path: Path, 
 
 def test_an_error_of_the_server_is_one_line_that_says_what_to_do(server: Server, tmp_path: Path) -> None:
     server.status = 404
-    with pytest.raises(FacerfError) as caught:
-        fetch(server.published(), OPTION, tmp_path)
-    assert str(caught.value) == (
-        f"{server.url}/models/a%20file.pth: cannot be fetched to {tmp_path / 'a file.pth'} (HTTP Error 404: "
-        "Not Found); run again with a network, put the file there, or use --weights PATH"
-    )
+    words = f"{server.url}/models/a%20file.pth: ... HTTP Error 404 ... put the file there, or use {OPTION}"
+    refused(FacerfError, words, fetch, server.published(), OPTION, tmp_path)
     assert server.asked == 1
 
 

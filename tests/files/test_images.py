@@ -1,8 +1,6 @@
 """Image files: round trips, metadata, and damaged files."""
 
 import logging
-import struct
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +9,10 @@ import pytest
 import tifffile
 
 from facerf_cli.errors import FacerfError, InputError, UsageError
-from facerf_cli.files.image_metadata import read_header
+from facerf_cli.files.image_metadata import COMPOSITE_SOURCE_TYPE, Provenance, read_header
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import HALF_MAX, write_display, write_exr, write_tiff
 from facerf_cli.image import colour
-from facerf_cli.run.logs import COMPOSITE_SOURCE_TYPE, Provenance
 from tests.exr_layers import exr_layers
 from tests.files.made import IPTC, MAP, TO_709, properties, write_hdr, write_oiio
 from tests.kinds import Log
@@ -95,8 +92,7 @@ def test_a_curve_on_floats_is_warned_of(tmp_path: Path, warned: pytest.LogCaptur
     assert "decoded by the curve of Rec.2020" in warned.text
 
 
-@pytest.mark.parametrize("space", [colour.ACESCG, colour.REC2020, colour.DISPLAY_P3, colour.LINEAR],
-                         ids=lambda space: space.name)  # fmt: skip
+@pytest.mark.parametrize("space", [colour.ACESCG, colour.REC2020], ids=lambda space: space.name)
 def test_the_user_overrides_the_file_s_colour_space(tmp_path: Path, space: colour.ColourSpace) -> None:
     path = write_oiio(tmp_path / "a.png", VALUES[..., :3], "uint16")
     expected = colour.to_linear_rec709(VALUES[..., :3], space)
@@ -185,15 +181,6 @@ def test_what_cannot_be_written(tmp_path: Path) -> None:
     refused(FacerfError, "cannot write", write_display, tmp_path / "file" / "a.png", VALUES[..., :3])
     refused(UsageError, "use .exr, .png or .jpg", write_display, tmp_path / "a.xyz", VALUES[..., :3])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file"]
-
-
-def test_real_files(shared_data: Path) -> None:
-    photo = read_image(shared_data / "photos" / "obama.jpg")
-    assert photo.pixels.shape == (1137, 910, 3) and photo.colourspace_name == "sRGB"
-    sky = read_image(shared_data / "hdri" / "kiara_1_dawn_1k.hdr")
-    assert sky.pixels.shape == (512, 1024, 3) and sky.pixels.max() > 2
-    face = read_image(shared_data / "extended_yale_b" / "yaleB02" / "yaleB02_P00A+000E+00.pgm")
-    assert face.pixels.shape == (192, 168, 3) and face.colourspace_name == "sRGB"
 
 
 def test_two_writes_of_any_time_give_the_same_bytes(tmp_path: Path) -> None:
@@ -300,8 +287,8 @@ def test_tiff_has_floats_their_profile_and_what_made_it(tmp_path: Path, name: st
     write_tiff(path, RGB * 3 - 0.5, ALPHA, FACTS, space)
     spec = oiio.ImageBuf(str(path)).spec()
     assert str(spec.format) == "float" and spec.nchannels == 4
-    header, image = read_header(path), read_image(path)
-    assert header is not None and header.space.name == space.name
+    image = read_image(path)
+    assert image.colourspace_name == space.name
     np.testing.assert_allclose(image.pixels, RGB * 3 - 0.5, atol=2e-3)  # the profile's rounding
     np.testing.assert_array_equal(image.alpha, ALPHA)
     found = properties(path.read_bytes())
@@ -313,16 +300,6 @@ def test_tiff_has_floats_their_profile_and_what_made_it(tmp_path: Path, name: st
     stored = oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT)
     multiplied = colour.from_linear_rec709(RGB * 3 - 0.5, space) * ALPHA[..., None]  # by OpenImageIO
     np.testing.assert_allclose(stored[..., :3], multiplied, atol=1e-6)
-
-
-def test_rows_of_a_png_are_less_those_above(tmp_path: Path) -> None:
-    write_display(tmp_path / "a.png", RGB)
-    data, at, packed = (tmp_path / "a.png").read_bytes(), 8, b""
-    while at < len(data):
-        length, kind = struct.unpack_from(">I4s", data, at)
-        packed += data[at + 8 : at + 8 + length] if kind == b"IDAT" else b""
-        at += 12 + length
-    assert set(zlib.decompress(packed)[:: 1 + 3 * RGB.shape[1]]) == {2}  # of each row the first byte
 
 
 def test_png_of_16_bits(tmp_path: Path) -> None:
@@ -340,10 +317,6 @@ def test_jpeg_keeps_the_resolution_of_colour(tmp_path: Path) -> None:
     write_display(tmp_path / "a.jpg", stripes)
     found = read_image(tmp_path / "a.jpg").pixels
     assert found[:, ::2, 0].min() > 0.8 and found[:, 1::2, 0].max() < 0.1
-    data = (tmp_path / "a.jpg").read_bytes()
-    frame = data.index(b"\xff\xc0")
-    height, width, channels = struct.unpack_from(">HHB", data, frame + 5)
-    assert (height, width) == (32, 32) and [data[frame + 11 + 3 * k] for k in range(channels)] == [0x11] * 3
 
 
 def test_a_jpeg_shows_an_image_with_alpha_over_black(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageOps
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES
 from facerf_cli.errors import InputError
@@ -75,6 +75,8 @@ def test_photos_of_phones_under_any_name(tmp_path: Path) -> None:
         np.testing.assert_allclose(stored[at], level, atol=4)
     shutil.copy(HEIC, tmp_path / "a.jpg")
     assert read_image(tmp_path / "a.jpg").pixels.shape == (64, 48, 3)
+    header = read_header(tmp_path / "a.jpg")
+    assert header is not None and (header.height_px, header.width_px, header.bits) == (64, 48, 8)
     memory.set_limit(48 * 64 * 24 - 1)
     with pytest.raises(
         InputError, match=r"phone\.heic: \d+ x \d+ pixels: needs \S+ GB of memory, .* --memory"
@@ -90,36 +92,18 @@ def by_pillow(levels: np.ndarray, path: Path, orientation: int) -> Path:
     return path
 
 
-@pytest.mark.parametrize(
-    ("suffix", "orientation"), [("jpg", 3), ("jpg", 6), ("jpg", 8), ("png", 5), ("tif", 6), ("webp", 7)]
-)
-def test_exif_orientation_turns_a_photo_upright_once(tmp_path: Path, suffix: str, orientation: int) -> None:
-    """A file is turned as EXIF says, and what is written of it needs no turning."""
-    stored = np.full((24, 40, 3), 40, np.uint8)
-    stored[:8, :8] = 220  # in the corner of the first row and the first column
-    image = read_image(by_pillow(stored, tmp_path / f"a.{suffix}", orientation))
-    # Where EXIF puts the first row and the first column.
-    row, column = {1: "tl", 2: "tr", 3: "br", 4: "bl", 5: "tl", 6: "tr", 7: "br", 8: "bl"}[orientation]
-    turned = orientation >= 5
-    assert image.pixels.shape == ((40, 24, 3) if turned else (24, 40, 3))
-    corner = image.pixels[{"t": np.s_[:8], "b": np.s_[-8:]}[row], {"l": np.s_[:8], "r": np.s_[-8:]}[column]]
-    assert corner.min() > 0.5 and (image.pixels > 0.3).all(-1).sum() == pytest.approx(64, abs=8)
-    write_display(tmp_path / "out.jpg", image.pixels, metadata={"Software": "x"})
-    with Image.open(tmp_path / "out.jpg") as written:
-        assert written.getexif().get(0x0112, 1) == 1 and written.size == image.pixels.shape[1::-1]
-    np.testing.assert_allclose(read_image(tmp_path / "out.jpg").pixels, image.pixels, atol=0.06)
-
-
-def test_every_orientation_is_another_image(tmp_path: Path) -> None:
-    """All eight, against Pillow's own transposition of an image without symmetry."""
-    from PIL import ImageOps
-
+@pytest.mark.parametrize("suffix", ["png", "tif", "webp", "jpg"])
+def test_exif_orientations_turn_a_photo_upright_once(tmp_path: Path, suffix: str) -> None:
+    """All eight, against Pillow's own transposition; what is written of it needs no turning."""
     for orientation in range(1, 9):
-        path = by_pillow(LEVELS, tmp_path / f"{orientation}.png", orientation)
+        path = by_pillow(BLOCKS, tmp_path / f"{orientation}.{suffix}", orientation)
         with Image.open(path) as stored:
             expected = np.asarray(ImageOps.exif_transpose(stored))
-        found = np.rint(levels_of(path)).astype(int)
-        np.testing.assert_array_equal(found, expected)
+        image = read_image(path)
+        np.testing.assert_allclose(255 * linear_to_srgb(image.pixels), expected, atol=1.1)
+    write_display(tmp_path / "out.jpg", image.pixels)
+    with Image.open(tmp_path / "out.jpg") as written:
+        assert written.getexif().get(0x0112, 1) == 1 and written.size == image.pixels.shape[1::-1]
 
 
 def test_a_psd_has_its_profile_and_its_composite(tmp_path: Path) -> None:
@@ -153,16 +137,6 @@ def test_floats_without_a_stated_space_are_one_line(tmp_path: Path, caplog: pyte
     assert not caplog.records
 
 
-def test_the_header_of_a_heic(tmp_path: Path) -> None:
-    """`read_header` agrees with the pixels, under any name."""
-    other = tmp_path / "IMG_1.jpg"
-    other.write_bytes(HEIC.read_bytes())
-    for path in (HEIC, other):
-        header = read_header(path)
-        assert header is not None and (header.height_px, header.width_px) == read_image(HEIC).pixels.shape[:2]
-        assert (header.is_floating, header.bits) == (False, 8)
-
-
 def test_an_ultra_hdr_jpeg_is_decoded_once() -> None:
     """Linear with the gain map applied, in the map's primaries: Rec.709, while the base is Display P3."""
     image = read_image(ULTRA_HDR)
@@ -171,5 +145,3 @@ def test_an_ultra_hdr_jpeg_is_decoded_once() -> None:
     assert image.alpha is None and image.colourspace_name == "linear Rec.709"
     np.testing.assert_allclose(image.pixels.mean((0, 1)), expected.mean((0, 1)), rtol=0.02)
     assert np.abs(image.pixels - expected).mean() < 0.01
-    header = read_header(ULTRA_HDR)
-    assert header is not None and header.space.name == "linear Rec.709"

@@ -83,6 +83,13 @@ def xyz(path: Path) -> None:
     path.write_bytes(path.read_bytes().replace(b"rgbe", b"xyze"))
 
 
+def old_runs(path: Path) -> None:
+    """A pixel of grey and, as 255 times 1, 1, 1, N, that many of it."""
+    made.write_hdr(path, np.full((2, 256, 3), 0.25))
+    header = path.read_bytes()[: -2 * 256 * 4]
+    path.write_bytes(header + 2 * (b"\x80\x80\x80\x7f" + b"\1\1\1\xff"))
+
+
 def inks_with_alpha(path: Path) -> None:
     values = np.full((6, 9, 5), 99, np.uint8)
     profile = icc_profiles.press_profile()
@@ -110,7 +117,7 @@ REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
         )
         for curve in ("Logarithmic", "Printing density")
     },
-    "runs.hdr": (made.long_runs, "old-style runs.* save it as EXR"),
+    "runs.hdr": (old_runs, "old-style runs.* save it as EXR"),
     "white8.tif": (lambda path: tifffile.imwrite(path, GREY, photometric="miniswhite"), WHITE),
     "white16.tif": (
         lambda path: tifffile.imwrite(path, GREY.astype(np.uint16), photometric="miniswhite"),

@@ -1,6 +1,5 @@
 """The proxy follows its fit and its hair, and casts the shadows of a head."""
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -13,7 +12,6 @@ from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
-from facerf_cli.light.transport import build_scene
 from facerf_cli.network.portrait import SKIN
 from facerf_cli.portrait import proxy as module
 from facerf_cli.portrait.parse import CLASSES, class_index
@@ -118,17 +116,6 @@ def test_shadows_of_points_are_cast_toward_their_places() -> None:
     neck, above = maps.positions_m[:, 72, 48], azel_to_direction(0.0, 60.0)
     below_chin, over_head = shadows.toward(torch.stack([neck + 0.02 * above, neck + 0.5 * above]))[:, 72, 48]
     assert below_chin > 0.9 and over_head < 0.1  # the chin is behind the first
-
-
-def test_all_lights_share_one_scene(monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = []
-    monkeypatch.setattr(module, "build_scene", lambda *given: calls.append("scene") or build_scene(*given))
-    mesh = replace(proxy())
-    shadows = Shadows(mesh, proxy_maps(mesh, square_camera(fit(), SQUARE)))
-    lights = torch.stack([azel_to_direction(*at) for at in ((80.0, 0.0), (0.0, 0.0), (0.0, 75.0))])
-    at_once = shadows.along(lights)
-    torch.testing.assert_close(at_once, torch.cat([shadows.along(light[None]) for light in lights]))
-    assert calls == ["scene"]
 
 
 def test_rays_of_a_pixel_are_those_of_the_frame_before() -> None:

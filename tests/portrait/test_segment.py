@@ -1,6 +1,5 @@
 """Layers lie where the network saw them; others in the photo are left out."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -116,36 +115,6 @@ def test_every_pixel_of_the_person_has_a_class_that_sums_to_the_matte(
     assert found.matte[20, 160] > 0.9 and found.layer("hair")[20, 160] > 0.9
 
 
-def test_the_nearest_view_weighs_most(monkeypatch: pytest.MonkeyPatch, people: PeopleNetworks) -> None:
-    def look(network: object, image: np.ndarray, wanted: Sequence[Square]) -> list[SquareView]:
-        smallest = min(square.side_px for square in wanted)
-        everywhere = torch.ones_like(places()[0], dtype=torch.bool)
-        return [
-            seen_of(square, {"skin" if square.side_px == smallest else "neck": everywhere})
-            for square in wanted
-        ]
-
-    monkeypatch.setattr(module, "look", look)
-    at_face = module.predicted_classes(people, photo(), FACE, module.small_image(photo()))[:, 70, 160]
-    assert at_face[CLASSES.index("skin")] == pytest.approx(0.745, abs=0.01)  # 1.6^-4 over the sum
-    assert at_face[CLASSES.index("neck")] > 0.2
-
-
-def test_hair_is_likelier_than_seen(monkeypatch: pytest.MonkeyPatch, people: PeopleNetworks) -> None:
-    def look(network: object, image: np.ndarray, wanted: Sequence[Square]) -> list[SquareView]:
-        everywhere = torch.ones_like(places()[0], dtype=torch.bool)
-        found = [seen_of(square, {"hair": everywhere}) for square in wanted]
-        for seen in found:
-            seen.logits[:] = -30
-            for name, share in (("hair", 0.325), ("skin", 0.325), ("background", 0.35)):
-                seen.logits[CLASSES.index(name)] = math.log(share)
-        return found
-
-    monkeypatch.setattr(module, "look", look)
-    at_face = module.predicted_classes(people, photo(), FACE, module.small_image(photo()))[:, 70, 160]
-    assert at_face[CLASSES.index("hair")] / at_face[CLASSES.index("skin")] == pytest.approx(1.3, rel=1e-3)
-
-
 EARS, HAIR, SKIN, GLASSES = (class_index(name) for name in ("ears", "hair", "skin", "glasses"))
 
 
@@ -184,10 +153,6 @@ def test_the_odds_are_multiplied_by_one_factor_near_the_ears_alone() -> None:
     assert lifted({"ears": 0.4, "skin": 0.6}, 10, 90)[EARS] == pytest.approx(0.4, abs=1e-4)
     assert lifted({"ears": 0.02, "hair": 0.98}, 10, 50)[HAIR] > 0.9
     assert lifted({"ears": 0.3, "glasses": 0.7}, 10, 50)[GLASSES] == pytest.approx(0.7)
-
-
-_SIDE, _BORDER, _EXTENT_PX = 64, 40, 50.0
-_UNSURE = slice(_BORDER - 6, _BORDER + 6)  # columns of which the network is unsure
 
 
 HEAD = HeadPlace(x_px=80.0, y_px=50.0, height_px=60.0, chin_px=80.0)

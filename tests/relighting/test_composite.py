@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-import pytest
 import torch
 from torch import Tensor
 
@@ -147,13 +146,6 @@ def test_own_light_gives_the_photo_back_and_eyes_keep_their_detail() -> None:
     face, screen, photo = flat_face(source)
     relit = detailed(face, screen, photo, torch.full((3, 128, 128), 0.2))
     np.testing.assert_allclose(relit[eyes], 0.5 * photo[eyes], rtol=0.02, atol=1e-3)
-
-
-@pytest.mark.parametrize("gain", [0.01, 1.0, 300.0])
-def test_brightness_of_the_light_scales_the_face(gain: float) -> None:
-    people, relit = PeopleInPhoto([in_photo(*unwrapped())]), scene().lit(OTHER)
-    once, scaled = (people.light_layer([Relit(texture)]) for texture in (relit, gain * relit))
-    np.testing.assert_allclose(scaled, gain * once, rtol=2e-3, atol=1e-4 * gain)
 
 
 HALF = np.zeros((HEIGHT_PX, WIDTH_PX), np.float32)  # whose right part is the person

@@ -89,14 +89,6 @@ def test_one_forward_pass_gives_the_head(models: Models) -> None:
     assert math.isnan(head.fit.error_iod) and head.fit.quality == "unknown"
 
 
-def test_another_network_gives_its_own_head(models: Models) -> None:
-    """A fit to landmarks would undo the difference."""
-    one, other = (
-        regress_photo(models.with_networks(geometry=Knows(yaw)), PHOTO, BOX, SIDES).fit for yaw in (0.0, 20.0)
-    )
-    assert (one.rotation - other.rotation).abs().max() > 0.3
-
-
 def test_the_mean_face_takes_the_regressed_pose(models: Models) -> None:
     network, mean = Knows(15.0), models.face.pose_only()
     own = replace(models.with_networks(geometry=network), face=mean)

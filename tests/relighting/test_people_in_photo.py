@@ -29,7 +29,6 @@ from facerf_cli.run.memory import batches
 from facerf_cli.work import photos
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import PhotoFace
-from facerf_cli.work.sequence import OpenShot
 from tests.refusals import refused
 
 SIZE = (4, 6)
@@ -142,21 +141,6 @@ def test_a_chosen_face_keeps_its_number_from_the_left(
     item, image = Item(Path("a.png"), Path("a"), "a"), LinearImage(np.zeros((4, 6, 3), np.float32))
     people = photos.find_people(item, image, PhotoOptions(Settings(), face=which), matte=None)
     assert [face.number for face in people] == numbers
-
-
-def test_the_face_of_a_shot_has_the_number_by_which_it_was_chosen() -> None:
-    head = SimpleNamespace(
-        landmarks_px=None, fit=SimpleNamespace(crop=SimpleNamespace(to_photo=lambda _: POINTS))
-    )
-    steady = SimpleNamespace(head=head, segmentation=SimpleNamespace(matte=None))
-    shot: Any = SimpleNamespace(
-        take_of=lambda _: SimpleNamespace(window=lambda *_: steady),
-        shot=SimpleNamespace(frames=[Item(Path("a.0001.png"), Path("a.0001"), "a.0001")]),
-        frames=SimpleNamespace(image=lambda _: None),
-        _options=PhotoOptions(Settings(), face="2"),
-        _facts_of=lambda *_: {},
-    )
-    assert OpenShot.fitted(shot, 0)[1].number == 2
 
 
 def test_people_leave_less_memory_for_lights_at_once() -> None:

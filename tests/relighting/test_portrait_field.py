@@ -23,9 +23,6 @@ from facerf_cli.person import Person, Target, fit
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.parse import class_index
 from facerf_cli.portrait.person import SEEN_PX, wider_square
-from facerf_cli.relighting import portrait_field
-from facerf_cli.relighting.detail import finer_detail
-from facerf_cli.relighting.fitting import reflectance_of
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.photo_light import source_light
@@ -83,8 +80,6 @@ def test_under_its_own_light_the_photo_comes_back_and_no_face_is_seen_through_wh
     inside = field.person.segmentation.matte > 0.9
     error = ((image - photo)[inside] ** 2).mean()
     assert 10 * np.log10(1 / error) > 30  # the maps are coarse, and grain is of a photo without light
-    alone = reflectance_of(models, head, "portrait", network_alone=True, photo=photo)
-    assert isinstance(alone, PortraitField) and alone.views[0].correction is None
     # Hair and glasses over the face are not the face's field.
     shown = copy(person.in_photo())
     height, width = shown.size_px
@@ -95,7 +90,7 @@ def test_under_its_own_light_the_photo_comes_back_and_no_face_is_seen_through_wh
 
 
 def test_a_grey_photo_stays_grey_in_white_light(models: Models, photo: np.ndarray) -> None:
-    grey = np.repeat(photo.mean(2, keepdims=True), 3, 2)
+    grey = np.repeat(photo[::2, ::2].mean(2, keepdims=True), 3, 2)
     face = find_faces(SHIPPED_NETWORKS.people, grey, "grey")[0]
     person = fit(models, grey, face=face, texture_side=64, white_balance=None)
     image = person.image(lamp(60), Target(background="none"))
@@ -197,24 +192,6 @@ def test_left_and_right_are_treated_alike_and_without_light_all_is_black(field: 
     torch.testing.assert_close(turned, field.field.relit(light.directions, light.weights[None], turn))
     as_seen = field.relit(light.directions, light.weights[None])
     assert (as_seen - turned).abs().mean() > 1e-3
-
-
-def test_the_detail_of_a_texture_is_computed_once_but_for_gradients(
-    field: PortraitField, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    computed: list[int] = []
-    monkeypatch.setattr(
-        portrait_field, "finer_detail", lambda *inputs: computed.append(1) or finer_detail(*inputs)
-    )
-    light, fresh = lamp(20), replace(field)
-    first, second = (fresh.relit(light.directions, light.weights[None]) for _ in range(2))
-    assert len(computed) == 1 and torch.equal(first, second)
-    texture = field.field.face.texture.clone().requires_grad_()
-    face_field = replace(field.field, face=replace(field.field.face, texture=texture))
-    fresh = replace(field, field=face_field)
-    for _ in range(2):
-        fresh.relit(light.directions, light.weights[None]).sum().backward()
-    assert texture.grad is not None and texture.grad.abs().sum() > 0
 
 
 def test_a_lamp_lights_its_side_and_one_behind_leaves_the_face_dark(

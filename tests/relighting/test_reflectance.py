@@ -5,7 +5,6 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from facerf_cli.baselines import Kind
 from facerf_cli.errors import InputError
 from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.topology import region_mask
@@ -46,7 +45,7 @@ def olats_of(
 
 
 def test_relit_by_its_own_light_the_photo_comes_back(models: Models, head: Head) -> None:
-    rig = rig_directions(60)
+    rig = rig_directions(40)
     own = olats_of(models, head, rig, network_alone=True)
     corrected = olats_of(models, head, rig)
     seen = head.face.visible > 0.9
@@ -74,27 +73,6 @@ def test_light_is_read_inside_a_face_that_is_seen_and_off_the_eyes(head: Head) -
     with pytest.raises(InputError, match="too little of the face"):
         photo_evidence(FaceTexture(face.texture, face.visible * sliver, face.normals))
     refused(InputError, "black", photo_evidence, FaceTexture(face.texture * 0, face.visible, face.normals))
-
-
-@pytest.mark.parametrize("kind", ["field", "portrait"])
-def test_two_lights_apart_add_up_to_both_at_once(kind: Kind) -> None:
-    """The whole person is linear in light."""
-    person = astronaut.person()
-    if kind == "field":
-        person = replace(person, reflectance=astronaut.field().field)
-    directions = torch.stack([azel_to_direction(60.0, 30.0), azel_to_direction(-70.0, 0.0)])
-    rgb = torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.1, 0.1]])
-
-    def image(weights: torch.Tensor) -> np.ndarray:
-        light = RigLight(directions, weights)
-        return person.image(light, Target(background="none"))
-
-    first = image(rgb * torch.tensor([[1.0], [0.0]]))
-    second = image(rgb * torch.tensor([[0.0], [1.0]]))
-    both = image(rgb)
-    assert np.abs(both).max() > 0.1 and both.min() >= -1e-3  # the correction may darken a highlight
-    # 24 bits of mantissa in sums of some ten terms; the bicubic undershoot, clamped at 0, adds the most
-    np.testing.assert_allclose(first + second, both, atol=1e-3 * float(both.mean()), rtol=1e-3)
 
 
 def test_a_turned_head_is_shown_alone_in_its_pose(models: Models, head: Head) -> None:

@@ -65,15 +65,6 @@ def test_two_sides_of_an_edge_keep_their_own_values() -> None:
     assert (found - wanted)[sure].abs().max() < 0.1
 
 
-def test_maps_of_any_layout_stay_as_they_are() -> None:
-    colours = colours_of(mixed(skin(SIDE, SCALE), DARK, BRIGHT)).expand(3, -1, -1)
-    by_pixel = torch.rand(SIDE, SIDE, 2, generator=torch.Generator().manual_seed(0))
-    before = by_pixel.clone()
-    trust = edge_confidence(colours, ONES, 0 * ONES)
-    found = EdgeFill.of(colours, trust, ONES, trust).filled(by_pixel.permute(2, 0, 1))
-    assert torch.equal(by_pixel, before) and (found.permute(1, 2, 0) != before).any()
-
-
 def test_a_block_of_light_on_plain_cloth_fades_and_none_of_it_crosses_an_edge() -> None:
     share = skin(SIDE, SCALE)
     colours = colours_of(mixed(share, DARK, BRIGHT)).expand(3, -1, -1)

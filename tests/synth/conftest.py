@@ -11,6 +11,7 @@ from torch import Tensor
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth import bank as bank_room
+from facerf_cli.synth import person
 from facerf_cli.synth.bank.heads import Bank, HeadBakeSettings, add_views, bake_heads, load_bank
 from facerf_cli.synth.bank.people import PeopleBankSettings, bake_person
 from facerf_cli.synth.bank.proxies import look_at_photos
@@ -50,7 +51,10 @@ def people_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bank of one person, whom two squares of a photo show; all processes of a run have the same."""
 
     def fill(folder: Path) -> None:
-        for name, tensors in bake_person(["builtin"], 10, SMALL, 1).items():
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(person, "_SMALL_PX", SMALL.side_px)  # a coarse mesh
+            made = bake_person(["builtin"], 10, SMALL, 1)
+        for name, tensors in made.items():
             save_file(tensors, folder / f"{name}.safetensors")
         look_at_photos(backgrounds(), SHIPPED_NETWORKS, 0, list(folder.glob("photo_*")))
 

@@ -11,9 +11,9 @@ from facerf_cli.light.mesh_transport import MeshTransport
 from facerf_cli.raster.camera import Camera, pose_to_rotation
 from facerf_cli.synth.appearance.materials import Appearance
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh, strandless
+from facerf_cli.synth.person import SyntheticPerson
 from facerf_cli.synth.renderer import images_under, light_of, view_of
 from facerf_cli.synth.shading import Material
-from facerf_cli.synth.subjects import Subject
 from facerf_cli.synth.views import StageCamera
 
 
@@ -66,15 +66,15 @@ def with_materials(person: Appearance, **factors: float) -> Appearance:
     return replace(person, materials=materials)
 
 
-def subject_of(mesh: HeadMesh, person: Appearance) -> Subject:
-    return Subject(mesh, person, torch.eye(3), torch.zeros(GRID * GRID, 3), np.zeros((68, 3)), {}, {})
+def person_of(mesh: HeadMesh, person: Appearance) -> SyntheticPerson:
+    return SyntheticPerson(mesh, person, torch.eye(3), torch.zeros(GRID * GRID, 3), np.zeros((68, 3)), {}, {})
 
 
 def photograph(
     mesh: HeadMesh, person: Appearance, transport: MeshTransport, camera: StageCamera, highlights: int = 12
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Render images [L, 3, S, S] in each light, and coverage [S, S]."""
-    subject = subject_of(mesh, person)
+    subject = person_of(mesh, person)
     view, surface = view_of(subject, light_of(subject, transport), camera)
     single = torch.eye(len(transport.directions))[..., None].expand(-1, -1, 3)
     return images_under(view, surface, single, highlights), view.alpha

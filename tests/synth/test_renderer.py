@@ -13,6 +13,7 @@ from facerf_cli.light.transport import BakeSettings
 from facerf_cli.portrait.parse import MORE_LANDMARKS, class_index
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh, joined, strandless
+from facerf_cli.synth.person import SyntheticPerson
 from facerf_cli.synth.renderer import (
     BakedView,
     albedo_of,
@@ -22,8 +23,7 @@ from facerf_cli.synth.renderer import (
     materials_of,
     view_of,
 )
-from facerf_cli.synth.subjects import Subject
-from tests.synth.shapes import appearance, ball, camera, material, photograph, square, subject_of
+from tests.synth.shapes import appearance, ball, camera, material, person_of, photograph, square
 
 POINT_LIGHT = BakeSettings(light_radius_deg=0, bounce_samples=0)
 AHEAD = np.array([[0.0, 0, 1]], np.float32)
@@ -107,7 +107,7 @@ def test_bounces_add_up() -> None:
     on_wall = head.normals[:, 0] < -0.5
     on_floor = ~on_wall & (head.vertices[:, 0] < 0.09)
     dim, bright = (
-        light_of(subject_of(head, appearance(material(albedo))), transport).bounced[:, 0]
+        light_of(person_of(head, appearance(material(albedo))), transport).bounced[:, 0]
         for albedo in (0.25, 0.5)
     )
     assert 0.05 < bright[on_wall].mean() < 0.25
@@ -186,24 +186,24 @@ SIDE_PX = 48
 
 
 @pytest.fixture(scope="module")
-def subject() -> Subject:
+def subject() -> SyntheticPerson:
     """A ball of skin beside a board of hair, turned a little."""
     skin, (u, v, faces) = ball(), square(25)
     wall = np.stack([0.12 * u - 0.06, 0.06 - 0.12 * v, 0 * u - 0.055], -1).reshape(-1, 3)
     hair = strandless("hair", wall, np.broadcast_to([0, 0, 1.0], wall.shape), faces, np.full((625, 2), 0.5))
     hair = replace(hair, tangents=np.broadcast_to(np.float32([0, -1, 0]), wall.shape).copy())
-    person = subject_of(joined(skin, hair), appearance(material((0.5, 0.4, 0.3), roughness=0.45)))
+    person = person_of(joined(skin, hair), appearance(material((0.5, 0.4, 0.3), roughness=0.45)))
     return replace(person, head_to_world=pose_to_rotation(10, 5, 0), more_landmarks_world={EAR: [0, 0.02, 0]})
 
 
 @pytest.fixture(scope="module")
-def view(subject: Subject) -> BakedView:
+def view(subject: SyntheticPerson) -> BakedView:
     lights = rig_directions(24).numpy().astype(np.float64)
     one = camera(SIDE_PX, 0.14, yaw_deg=-15)
     return view_of(subject, bake_light(subject, [one], lights, BakeSettings(bounce_samples=8), 0), one)[0]
 
 
-def test_images_are_sums_over_lights_and_files_keep_them(subject: Subject, view: BakedView) -> None:
+def test_images_are_sums_over_lights_and_files_keep_them(subject: SyntheticPerson, view: BakedView) -> None:
     weights = torch.rand(1, 24, 3, generator=torch.Generator().manual_seed(0)) ** 4 / 6
     surface, single = materials_of(view, subject.appearance), torch.eye(24)[..., None].expand(-1, -1, 3)
     olats = images_under(view, surface, single)
@@ -218,7 +218,7 @@ def test_images_are_sums_over_lights_and_files_keep_them(subject: Subject, view:
     assert off.mean() < 0.01 * image.mean()
 
 
-def test_truth_lies_beside_the_photo(subject: Subject, view: BakedView) -> None:
+def test_truth_lies_beside_the_photo(subject: SyntheticPerson, view: BakedView) -> None:
     surface = materials_of(view, subject.appearance)
     photo, alpha = images_under(view, surface, torch.full((1, 24, 3), 0.1))[0], view.alpha
     albedo, normals = albedo_of(view, surface)
@@ -229,7 +229,7 @@ def test_truth_lies_beside_the_photo(subject: Subject, view: BakedView) -> None:
     assert (photo[:, alpha == 0] == 0).all()
 
 
-def test_landmarks_and_pose_are_those_of_the_camera(subject: Subject, view: BakedView) -> None:
+def test_landmarks_and_pose_are_those_of_the_camera(subject: SyntheticPerson, view: BakedView) -> None:
     assert torch.allclose(view.landmarks_px[:68], torch.tensor([SIDE_PX / 2, SIDE_PX / 2]), atol=1e-3)
     ear = view.landmarks_px[68 + MORE_LANDMARKS.index(EAR)]
     assert view.landmarks_px[68:].isnan().all(1).sum() == len(MORE_LANDMARKS) - 1

@@ -10,7 +10,7 @@ from facerf_cli.face.fit import fit_batch
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometryNetworkSettings
 from facerf_cli.raster.camera import crop_camera
-from facerf_cli.synth.bank.face_crops import RenderedFaces
+from facerf_cli.synth.bank.geometry_crops import GeometryPhotos
 from facerf_cli.synth.bank.people import read_photo
 from facerf_cli.training.geometry import GeometryObjective, GeometryObjectiveSettings
 from facerf_cli.training.objective import seeded
@@ -33,12 +33,12 @@ def folder(people_folder: Path, tmp_path_factory: Folders) -> Path:
 
 
 @pytest.fixture(scope="module")
-def faces(folder: Path) -> RenderedFaces:
-    return RenderedFaces(folder, backgrounds(), {"licence": "MIT"})
+def faces(folder: Path) -> GeometryPhotos:
+    return GeometryPhotos(folder, backgrounds(), {"licence": "MIT"})
 
 
 @pytest.fixture
-def objective(faces: RenderedFaces) -> GeometryObjective:
+def objective(faces: GeometryPhotos) -> GeometryObjective:
     torch.manual_seed(0)
     return GeometryObjective(faces, settings=FEW)
 
@@ -92,4 +92,4 @@ def test_validation_is_the_same_every_time_and_shows_it(objective):
 
 
 def test_no_images_is_said(tmp_path):
-    refused(InputError, "no photos", RenderedFaces, tmp_path, backgrounds(), {})
+    refused(InputError, "no photos", GeometryPhotos, tmp_path, backgrounds(), {})

@@ -12,7 +12,7 @@ from facerf_cli.network.features import LightNetwork, LightSettings
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.raster.texture import unwrap
 from facerf_cli.synth.bank.heads import Bank
-from facerf_cli.synth.bank.texture_samples import Sample, camera_matrix
+from facerf_cli.synth.bank.texture_samples import TEXTURE_CAMERA, Sample
 from facerf_cli.training.light_features import LightFeaturesObjective
 from facerf_cli.training.objective import seeded
 from facerf_cli.training.texture import PeopleSettings
@@ -86,7 +86,7 @@ def test_the_crops_of_a_stack_give_its_textures(tmp_path: Path) -> None:
 
 
 def test_cameras_cast_colours() -> None:
-    matrices = torch.stack([camera_matrix(seeded(draw)) for draw in range(400)])
+    matrices = torch.stack([TEXTURE_CAMERA.colours(seeded(draw)) for draw in range(400)])
     grey = matrices[:, 0, 1] > 0
     cast, mixed = matrices[~grey], matrices[grey]
     assert 0.2 < grey.float().mean() < 0.3

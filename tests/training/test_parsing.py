@@ -8,12 +8,12 @@ from torch import Tensor, nn
 
 from facerf_cli.network.parsing import Parsing, ParsingNetwork
 from facerf_cli.portrait.parse import CLASSES, LANDMARKS, class_index
-from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
+from facerf_cli.synth.bank.parsing_crops import ParsingCrops, ParsingPhotos
 from facerf_cli.training.parsing import ParsingObjective
 from tests.training.toy_parsing import SETTINGS, SIDE, Portraits, truth
 
 
-def seen(batch: PortraitCrops, sure: float = 30.0) -> Parsing:
+def seen(batch: ParsingCrops, sure: float = 30.0) -> Parsing:
     """What a perfect network says."""
     shown = torch.where(batch.alpha > 0.5, batch.label, 0)
     logits = sure * nn.functional.one_hot(shown, len(CLASSES)).permute(0, 3, 1, 2).float()
@@ -35,11 +35,11 @@ class Answers(nn.Module):
 
 
 def objective_of(answer: Parsing) -> ParsingObjective:
-    portraits = cast(StoredPortraits, Portraits())
+    portraits = cast(ParsingPhotos, Portraits())
     return ParsingObjective(portraits, cast(ParsingNetwork, Answers(answer)), SETTINGS)
 
 
-def terms(answer: Parsing, batch: PortraitCrops | None = None) -> dict[str, float]:
+def terms(answer: Parsing, batch: ParsingCrops | None = None) -> dict[str, float]:
     found = objective_of(answer)(batch or truth())
     return {name: float(term) for name, term in found.items()}
 

@@ -6,7 +6,7 @@ import torch
 
 from facerf_cli.network.parsing import ParsingSettings
 from facerf_cli.portrait.parse import CLASSES, LANDMARKS, class_index
-from facerf_cli.synth.bank.parsing import PortraitCrops
+from facerf_cli.synth.bank.parsing_crops import ParsingCrops
 from facerf_cli.training.parsing import ParsingObjectiveSettings
 
 SIDE = 8
@@ -22,11 +22,11 @@ class Portraits:
     def people(self, held_out: int) -> tuple[list[int], list[int]]:
         return [1], [0]
 
-    def draw(self, people: list[int], side: int, generator: torch.Generator) -> PortraitCrops:
+    def draw(self, people: list[int], side: int, generator: torch.Generator) -> ParsingCrops:
         return truth()
 
 
-def truth(side: int = SIDE) -> PortraitCrops:
+def truth(side: int = SIDE) -> ParsingCrops:
     label = torch.full((1, side, side), class_index("skin"))
     label[:, :2] = class_index("ears")  # a rare class
     alpha = torch.ones(1, side, side)
@@ -34,6 +34,6 @@ def truth(side: int = SIDE) -> PortraitCrops:
     known = torch.ones(1, LANDMARKS, dtype=torch.bool)
     known[:, 68:] = False
     places = torch.rand(1, LANDMARKS, 2, generator=torch.Generator().manual_seed(0)) * 0.5 + 0.25
-    return PortraitCrops(
+    return ParsingCrops(
         torch.rand(1, 3, side, side), alpha, label, torch.ones(1, side, side), places, known, torch.ones(1)
     )

@@ -12,12 +12,11 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from facerf_cli.capture.capture import Capture, FrameSizeError, unlisted_kind
+from facerf_cli.capture.capture import Capture, FrameSizeError
 from facerf_cli.capture.findings import Finding
 from facerf_cli.errors import InputError
 
 _AT_THE_TOP = 1 - 1e-5  # of a frame's maximum: arithmetic may move clipped values this far apart
-_LISTED = 3  # file names of a message
 _MOST_OF_ANOTHER_SIZE = 0.5  # of a camera's frames: with more, the camera's description is wrong
 _BLACK = 1e-3  # of the median of the frames' maxima: less than any light on skin leaves
 _FLAT = 1e-6  # of a frame's maximum
@@ -114,7 +113,7 @@ def reaches_face(directions: np.ndarray) -> np.ndarray:
 
 
 def check_missing(capture: Capture, subject: str, camera: str) -> Iterator[Finding]:
-    """Report each missing frame of a camera; a camera without frames, or extra files, as one warning."""
+    """Report each missing frame of a camera; a camera without frames as one warning."""
     paths = {light: capture.frame_path(subject, camera, light) for light in capture.light_ids}
     marked = capture.marked.get(subject, frozenset())
     missing = [light for light in paths if not capture.has_frame(subject, camera, light)]
@@ -125,24 +124,6 @@ def check_missing(capture: Capture, subject: str, camera: str) -> Iterator[Findi
         missing = []
     for light in (light for light in missing if light not in marked):
         yield Finding("error", "missing", subject, f"{paths[light]}: no such file; copy it", camera, light)
-    if extra := extra_names(capture, subject, camera):
-        names = ", ".join(extra[:_LISTED]) + (", ..." if len(extra) > _LISTED else "")
-        words = f"{len(extra)} files belong to no light ({names}); list their lights, or remove them"
-        yield Finding("warning", "extra", subject, words, camera, figures={"files": len(extra)})
-
-
-def extra_names(capture: Capture, subject: str, camera: str) -> list[str]:
-    """Return the sorted names in the light's place that belong to no light, to a full or an ambient image."""
-    mark = "\x01"  # occurs in no name
-    path = capture.frame_path(subject, camera, mark)
-    if path.name.count(mark) != 1 or mark in str(path.parent):  # {light} is a folder's name, or stands twice
-        return []
-    prefix, after = path.name.split(mark)
-    files = [file.name for file in path.parent.glob("*") if file.is_file() and file.name[0] != "."]
-    fitting = [name for name in files if name.startswith(prefix) and name.endswith(after)]
-    names = {name[len(prefix) : len(name) - len(after)] for name in fitting}
-    others = names - {"", *capture.light_ids, *capture.ignored}
-    return sorted(name for name in others if not unlisted_kind(name))
 
 
 def check_readable(frames: CameraFrames, unread: Mapping[str, InputError]) -> Iterator[Finding]:

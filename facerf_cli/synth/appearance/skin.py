@@ -63,19 +63,15 @@ def draw_relief(
     dents = noise(count, window, 6.0, generator, octaves=1)
     coarse = 0.6 + 0.5 * age + 0.4 * each(people.oiliness)
     grain = 0.03 * min(1.0, min(window.texel_mm)) * grain
-    height = coarse * (_pore_places(window) * (grain + 0.022 * pores) + 0.014 * dents)
+    # Pores are strong on nose, inner cheeks and chin, and weak near the eyes.
+    strength = 0.9 * blob(window, 30, 15) + 0.7 * blobs(window, 0.37, 0.52, 22) + 0.4 * blob(window, 8, 14)
+    height = coarse * ((0.55 + strength.clamp(0, 1)) * (grain + 0.022 * pores) + 0.014 * dents)
     lips = mask(window, "lips", 1.5)
     lines = noise(count, window, (1.7, 9.0), generator, octaves=1)
     height = height * (1 - lips) + lips * 0.07 * lines
     wrinkles = _wrinkles(people, window, generator)
     relief = slopes(height * bare - wrinkles * (1 - lips), window)
     return relief.clamp(-0.8, 0.8), (wrinkles / 0.6).clamp(0, 1.2)
-
-
-def _pore_places(window: Window) -> Tensor:
-    """Return the strength [1, 1, T, T] of pores: high on nose, inner cheeks and chin, low near the eyes."""
-    cheeks = blobs(window, 0.37, 0.52, 22)
-    return 0.55 + (0.9 * blob(window, 30, 15) + 0.7 * cheeks + 0.4 * blob(window, 8, 14)).clamp(0, 1)
 
 
 @lru_cache(maxsize=1)  # all people share it

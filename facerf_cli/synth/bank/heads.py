@@ -218,12 +218,6 @@ class HeadPhoto:
     landmarks_px: Tensor  # [68, 2] in the crop, with the errors of a detector
 
 
-def landmarks_of(vertices: Tensor) -> Tensor:
-    """Return landmarks [68, 3] of the canonical mesh [V, 3]."""
-    corners, weights = landmark_weights()
-    return (vertices[corners] * weights[..., None]).sum(1)
-
-
 def photograph_head(vertices: Tensor, random: Random, settings: ViewSettings) -> HeadPhoto:
     """Take one random photo of a head [V, 3] (head frame)."""
     frontal = random.random() < settings.frontal_share
@@ -238,7 +232,9 @@ def photograph_head(vertices: Tensor, random: Random, settings: ViewSettings) ->
     )
     vertices_camera = vertices @ rotation.T + centre_m.float()
     photo = Camera(focal_px, _PHOTO_SIDE_PX, _PHOTO_SIDE_PX, _PHOTO_SIDE_PX / 2, _PHOTO_SIDE_PX / 2)
-    landmarks_px = _detected(project(landmarks_of(vertices_camera), photo), random, settings)
+    corners, weights = landmark_weights()
+    landmarks = (vertices_camera[corners] * weights[..., None]).sum(1)
+    landmarks_px = _detected(project(landmarks, photo), random, settings)
     crop = from_landmarks(landmarks_px.numpy(), settings.crop_px)
     scale = crop.size_px / crop.side_px
     camera = Camera(

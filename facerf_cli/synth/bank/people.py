@@ -31,10 +31,10 @@ from facerf_cli.synth.appearance.materials import draw_appearance
 from facerf_cli.synth.bank import Files, fill
 from facerf_cli.synth.bank.heads import cached_face_model
 from facerf_cli.synth.bank.texture_samples import draw_light
+from facerf_cli.synth.person import SyntheticPerson, draw_person
 from facerf_cli.synth.random_fields import Random, generators
 from facerf_cli.synth.renderer import BakedView, bake_light, images_under, materials_of, view_of
 from facerf_cli.synth.shading import Material
-from facerf_cli.synth.subjects import Subject, draw_subject
 from facerf_cli.synth.views import StageCamera
 
 # Bounced light is smoothed over more than an edge of cloth, where few rays would leave spots.
@@ -69,9 +69,11 @@ class PeopleBankSettings:
     lights: int = 48
     side_px: int = SIDE_PX
     photo_px: int = PHOTO_PX
-    with_squares: bool = True  # without them the photos are the same
+    with_squares: bool = True
 
 
+# Photos show faces of about 100 pixels, for which coarse meshes and few lights suffice.
+PHOTO_BANK = PeopleBankSettings(lights=24, side_px=96, with_squares=False)
 TINY_BANK = PeopleBankSettings(cameras=1, squares=1, images=1, looks=1, lights=12, side_px=96, photo_px=128)
 
 
@@ -102,25 +104,25 @@ def bake_person(face_models: list[str], seed: int, settings: PeopleBankSettings,
     """
     random, generator = generators(seed, index, 5)
     model = cached_face_model(face_models[index % len(face_models)])
-    subject = draw_subject(model, index, seed, settings.side_px, arms=True)
-    drawn = _draw_cameras(subject, random, settings)
+    person = draw_person(model, index, seed, settings.side_px, arms=True)
+    drawn = _draw_cameras(person, random, settings)
     turn = pose_to_rotation(*random.uniform(-180, 180, 3).tolist()).double()
     directions = (rig_directions(settings.lights).double() @ turn).numpy()
     cameras = [camera for one in drawn for camera in (one.photo, *one.squares)]
-    light = bake_light(subject, cameras, directions, _BAKE, index)
+    light = bake_light(person, cameras, directions, _BAKE, index)
     others = [draw_appearance(_LOOK_PX, generator) for _ in range(settings.looks - 1)]
     files: Files = {}
     for number, one in enumerate(drawn):
-        view, own = view_of(subject, light, one.photo)
+        view, own = view_of(person, light, one.photo)
         looks = [own, *(materials_of(view, look) for look in others)]
         files[f"{PHOTO}{index:05d}_{number}"] = {
             **_photo(view, looks, settings.images, generator),
-            **_fit(subject, one.photo),
+            **_fit(person, one.photo),
             "squares": one.crops,
             "rows": torch.tensor(one.rows),
         }
         for k, square in enumerate(one.squares if settings.with_squares else []):
-            view, own = view_of(subject, light, square)
+            view, own = view_of(person, light, square)
             looks = [own, *(materials_of(view, look) for look in others)]
             files[f"{index:05d}_{number * settings.squares + k}"] = view.packed() | {
                 f"look_{name}": torch.stack([getattr(look, name) for look in looks]).half()
@@ -133,14 +135,15 @@ def _photo(
     view: BakedView, looks: list[Material], images: int, generator: torch.Generator
 ) -> dict[str, Tensor]:
     """Render the images of a photo, and its truth; see `bake_person`."""
-    stored = []
-    for number in range(images):
-        weights = draw_photo_light(view.directions, generator, _KEY_LIGHT)
-        (image,) = images_under(view, looks[number % len(looks)], weights[None])
-        mean = image.sum() / 3 / view.alpha.sum().clamp_min(1)
-        stored.append((255 * (image / (BRIGHTEST * mean.clamp_min(1e-6))).clamp(0, 1).sqrt()).round().byte())
+    weights = [draw_photo_light(view.directions, generator, _KEY_LIGHT) for _ in range(images)]
+    radiance = torch.empty(images, 3, *view.alpha.shape)
+    for first, look in enumerate(looks[:images]):
+        every = slice(first, None, len(looks))
+        radiance[every] = images_under(view, look, torch.stack(weights[every]))
+    mean = radiance.sum((1, 2, 3), keepdim=True) / 3 / view.alpha.sum().clamp_min(1)
+    relative = (radiance / (BRIGHTEST * mean.clamp_min(1e-6))).clamp(0, 1)
     return {
-        "images": torch.stack(stored),
+        "images": (255 * relative.sqrt()).round().byte(),
         "alpha": (255 * view.alpha).round().byte(),
         "label": 1 + view.classes[..., 1:].argmax(-1).byte(),
         "landmarks_px": view.landmarks_px,
@@ -148,9 +151,9 @@ def _photo(
     }
 
 
-def _fit(subject: Subject, camera: StageCamera) -> dict[str, Tensor]:
+def _fit(person: SyntheticPerson, camera: StageCamera) -> dict[str, Tensor]:
     """Fit the built-in model to the true landmarks of a photo; see `bake_person`."""
-    landmarks_m = torch.from_numpy(subject.landmarks_world).float()
+    landmarks_m = torch.from_numpy(person.landmarks_world).float()
     points_px = project(camera.to_camera(landmarks_m), camera.camera)
     crop = from_landmarks(points_px.numpy(), GEOMETRY_PX)
     in_crop = torch.from_numpy(crop.to_crop(points_px.numpy())).float()
@@ -172,21 +175,23 @@ class _Views(NamedTuple):
     rows: int
 
 
-def _draw_cameras(subject: Subject, random: Random, settings: PeopleBankSettings) -> list[_Views]:
+def _draw_cameras(person: SyntheticPerson, random: Random, settings: PeopleBankSettings) -> list[_Views]:
     """Draw cameras with squares like in users' photos."""
     shape = settings.cameras, settings.squares
     scales = SIDES * np.exp(random.normal(0, _SIDES_STD, shape))
-    return [_draw_views(subject, sides, random, settings) for sides in scales]
+    return [_draw_views(person, sides, random, settings) for sides in scales]
 
 
-def _draw_views(subject: Subject, scales: np.ndarray, random: Random, settings: PeopleBankSettings) -> _Views:
+def _draw_views(
+    person: SyntheticPerson, scales: np.ndarray, random: Random, settings: PeopleBankSettings
+) -> _Views:
     """Draw a camera that takes squares of these sides [K] in faces, a little off."""
     limit_deg = np.array(_POSE_MAX_DEG)
     pose_deg = random.normal(0, _POSE_STD_DEG).clip(-limit_deg, limit_deg)
     rotation = pose_to_rotation(*pose_deg.tolist())
     distance_m = math.exp(random.uniform(*np.log((_NEAREST * scales.max(), _FARTHEST_M))))
     towards = torch.tensor([*random.normal(0, 0.05, 2), -distance_m]).float()  # off the axis of the lens
-    landmarks = torch.from_numpy(subject.landmarks_world).float() @ rotation.T.float() + towards
+    landmarks = torch.from_numpy(person.landmarks_world).float() @ rotation.T.float() + towards
     seen = project(landmarks, Camera(1.0, 1, 1, 0.0, 0.0)).double()
     low, high = seen.amin(0), seen.amax(0)
     middle, face = ((low + high) / 2).numpy(), float((high - low).max())

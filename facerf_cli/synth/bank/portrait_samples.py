@@ -45,7 +45,7 @@ _BACK_EL_DEG, _BACK_AZ_DEG, _BACK = (0.0, 40.0), 120.0, 0.08
 class StoredView:
     """View from a bank, and the materials of its facets in several looks."""
 
-    portrait: BakedView
+    baked: BakedView
     looks: list[Material]
 
 
@@ -96,7 +96,7 @@ class PortraitSource(Protocol):
         """Draw one sample [1, ...] of some people, with `targets` lights, of a side if one is given."""
 
 
-class StoredSquares:
+class PortraitSquares:
     """Squares of a bank, read when they are drawn."""
 
     def __init__(self, folder: Path, backgrounds: Tensor, provenance: dict[str, Any]) -> None:
@@ -105,7 +105,7 @@ class StoredSquares:
             if seen_path(path).exists() and seen_path(path).stat().st_size > _EMPTY_BYTES:
                 people.setdefault(path.stem.split("_")[0], {})[path] = _side_px(path)
         if not people:
-            raise InputError(f"{folder}: no portraits; make them with `facerf train --stage portrait`")
+            raise InputError(f"{folder}: no squares; bake people with `facerf train --stage portrait`")
         self.views = list(people.values())
         self.backgrounds = backgrounds
         self.provenance = provenance
@@ -127,17 +127,17 @@ class StoredSquares:
         path = views[_below(len(views), generator)]
         view = load_view(path)
         surface = view.looks[_below(len(view.looks), generator)]
-        rig = view.portrait.directions
+        rig = view.baked.directions
         weights = source_light(rig, generator)
         chosen = draw_targets(rig, targets, generator)
         single = torch.eye(len(rig))[chosen, :, None].expand(-1, -1, 3)
-        albedo, normals = albedo_of(view.portrait, surface)
+        albedo, normals = albedo_of(view.baked, surface)
         lit = LitPerson(
-            images=images_under(view.portrait, surface, torch.cat([weights[None], single])),
+            images=images_under(view.baked, surface, torch.cat([weights[None], single])),
             albedo=albedo,
             normals=normals,
-            shares=view.portrait.classes.permute(2, 0, 1),
-            behind=1 - view.portrait.alpha,
+            shares=view.baked.classes.permute(2, 0, 1),
+            behind=1 - view.baked.alpha,
             rig=rig,
             weights=weights,
             chosen=chosen,

@@ -10,12 +10,12 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from facerf_cli.batch.recipe import is_made_from
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop, from_landmarks
 from facerf_cli.face.fit import fit_landmarks
 from facerf_cli.face.morphable import BUILTIN
 from facerf_cli.files.atomic import atomic_path
+from facerf_cli.files.texts import is_made_from
 from facerf_cli.network.portrait import SKIN
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.find import find_faces

@@ -19,9 +19,11 @@ from facerf_cli.network.batch import Batch
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.raster.texture import bake_attributes, inpaint, normal_map, texel_centres_uv
 from facerf_cli.synth.appearance.skin import draw_skin
+from facerf_cli.synth.camera import SimulatedCamera, recoloured
 from facerf_cli.synth.random_fields import LANDMARK_MM, Uniform, Window, mask, noise, places_mm, smooth
 from facerf_cli.synth.shading import Skin, diffuse_irradiance, highlights, scatter, tilt_normals, unit_along
 
+TEXTURE_CAMERA = SimulatedCamera(white=(1.95, 6.5), blur_px=1.85, noise=0.025)
 _FLASH_SHARE = 0.2  # share of draws that are lit by a flash near the camera
 _LIDS_MM, _LASHES_MM = 3.0, 7.0  # distance from the eye
 _LASHES_PASS = 0.6  # share of light that passes between them
@@ -125,59 +127,17 @@ def simulate_camera(
     Sources get a colour cast, clipping, blur, a tone curve and noise, and a mean of `MEAN_RADIANCE`. Targets
     get the same cast, and the scale that makes the mean albedo of the visible face `MEAN_RADIANCE`.
     """
-    faces = len(source)
-    uniform = Uniform(generator, (faces, 1, 1, 1))
-    balance, grey = _colours_of_camera(uniform, faces)
-    source, target, albedo = (
-        _greyed(x, grey) for x in (source * balance, target * balance[:, None], albedo * balance)
-    )
-    target = target * (MEAN_RADIANCE / _mean(albedo, visible))[:, None]
-    return CameraResponse.draw(faces, source.shape[-1], generator).apply(source, visible), target
+    colours = torch.stack([TEXTURE_CAMERA.colours(generator) for _ in source])
+    source, albedo = recoloured(source, colours), recoloured(albedo, colours)
+    target = recoloured(target, colours[:, None]) * (MEAN_RADIANCE / _mean(albedo, visible))[:, None]
+    means = _mean(source, visible)
+    photos = [TEXTURE_CAMERA.take(*one, generator) for one in zip(source, means, strict=True)]
+    return exposed(torch.stack(photos), visible), target
 
 
-@dataclass(frozen=True)
-class CameraResponse(Batch):
-    """Clipping, blur, tone curve and noise of the cameras of B faces; [B, 1, 1, 1] but for the noise."""
-
-    clip: Tensor
-    sigma_texels: Tensor
-    gamma: Tensor
-    noise: Tensor  # [B, 3, T, T]
-
-    @staticmethod
-    def draw(faces: int, side: int, generator: torch.Generator) -> "CameraResponse":
-        """Draw the cameras of textures of a side."""
-        uniform = Uniform(generator, (faces, 1, 1, 1))
-        clip, sigma_texels = uniform(1.6, 6.0), uniform(0, 1.2)
-        gamma = torch.exp(uniform(-0.22, 0.22))
-        noise = torch.randn(faces, 3, side, side, generator=generator) * uniform(0, 0.02)
-        return CameraResponse(clip, sigma_texels, gamma, noise)
-
-    def apply(self, source: Tensor, visible: Tensor) -> Tensor:
-        """Photograph sources [B, 3, T, T], exposed to a mean of `MEAN_RADIANCE`."""
-        source = source / _mean(source, visible)
-        sigma_texels = self.sigma_texels.view(-1, 1).expand(-1, 3).clamp_min(0.05)
-        source = scatter((source / self.clip).clamp(0, 1), sigma_texels) ** self.gamma
-        source = (source + self.noise * (source + 0.02).sqrt()).clamp(0, 1)
-        return source / _mean(source, visible) * MEAN_RADIANCE
-
-
-def camera_matrix(generator: torch.Generator) -> Tensor:
-    """Draw the matrix [3, 3] from true colours to those of a simulated camera, or of one without colours."""
-    balance, grey = _colours_of_camera(Uniform(generator, (1, 1, 1, 1)), 1)
-    return _greyed(balance * torch.eye(3)[..., None, None], grey)[..., 0, 0].T
-
-
-def _colours_of_camera(uniform: Uniform, faces: int) -> tuple[Tensor, Tensor]:
-    """Balance [B, 3, 1, 1] of the cameras of B faces, and 1 where one sees no colours [B, 1, 1, 1]."""
-    return torch.exp(uniform(-0.12, 0.12, faces, 3, 1, 1)), (uniform(0, 1) < 0.25).float()
-
-
-def _greyed(field: Tensor, grey: Tensor) -> Tensor:
-    """Remove the colour of the faces [B, ..., 3, T, T] where grey [B, 1, 1, 1] is 1."""
-    mixed = field.mean(-3, keepdim=True)
-    share = grey.view(-1, *([1] * (field.dim() - 1)))
-    return field * (1 - share) + mixed * share
+def exposed(source: Tensor, visible: Tensor) -> Tensor:
+    """Scale textures [B, 3, T, T] to a mean of `MEAN_RADIANCE` over the visible texels [B, 1, T, T]."""
+    return source / _mean(source, visible) * MEAN_RADIANCE
 
 
 def _mean(field: Tensor, visible: Tensor) -> Tensor:

@@ -57,7 +57,9 @@ def draw_body(
     packed = WHOLE if arms else ""
     chin = chin_height_m(head)
     grown = random.uniform(0.93, 1.06) * random.uniform([0.96, 1.0, 0.96], [1.08, 1.0, 1.06])
-    origin = np.array([0, chin - _NECK_M, _neck_depth_m(head, chin - _NECK_M)])
+    at_neck = head.is_part("skin") & (np.abs(head.vertices[:, 1] - (chin - _NECK_M)) < 0.006)
+    ring = head.vertices[at_neck, 2]
+    origin = np.array([0, chin - _NECK_M, float(ring.min() + ring.max()) / 2])
     skin, faces = packed_mesh(packed + "body")
     skin = skin * grown + origin
     low = (head.is_part("skin")) & (head.vertices[:, 1] < chin - _LOW_M)
@@ -90,13 +92,6 @@ def chin_height_m(head: HeadMesh) -> float:
 def clearance_m(person: HeadMesh) -> np.ndarray:
     """Return how far [V] off the surface rays must start, since neck and body lie closely over each other."""
     return _OVERLAP_M * (person.label == class_index("neck"))
-
-
-def _neck_depth_m(head: HeadMesh, level_m: float) -> float:
-    """Return the depth z of the neck's middle at a height."""
-    skin = head.vertices[head.is_part("skin")]
-    ring = skin[np.abs(skin[:, 1] - level_m) < 0.006, 2]
-    return float(ring.min() + ring.max()) / 2
 
 
 def _carried(points: np.ndarray, body: np.ndarray, shifts: np.ndarray) -> np.ndarray:

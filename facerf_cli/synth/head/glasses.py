@@ -43,7 +43,8 @@ def draw_glasses(head: HeadMesh, landmarks_m: np.ndarray, random: Random) -> Gla
     rims = _settled(rims, surface, landmarks_m, depth + _GAP_M)
     parts = []
     for rim in rims:
-        visible = rim if kind != "half-rim" else _upper(rim)
+        # Half-rim glasses have the upper half of a rim, and a little down both sides.
+        visible = rim if kind != "half-rim" else np.roll(rim, 4, 0)[: len(rim) // 2 + 8]
         parts.append(_tube(visible, np.array([0, 0, 1.0]), width, depth, closed=kind != "half-rim"))
     parts.append(_bridge(rims, surface, width, depth, 0.15))
     if kind == "aviator":
@@ -146,12 +147,6 @@ def _settled(
     eyes = landmarks_m[np.arange(36, 48), 2].max() + 0.009  # room for the lashes
     need = max(need, eyes - float(np.mean([rim[:, 2].mean() for rim in rims])))
     return [rim + np.array([0, 0, need]) for rim in rims]
-
-
-def _upper(rim: np.ndarray) -> np.ndarray:
-    """Return the part of a rim that half-rim glasses have: its upper half, and a little down both sides."""
-    order = np.roll(rim, 4, 0)
-    return order[: len(rim) // 2 + 8]
 
 
 def _bridge(

@@ -84,7 +84,8 @@ def grow_hair(head: HeadMesh, style: HairStyle, random: Random) -> HeadMesh:
     paths = wisps.grow(length)
     if style.comb == "tied":
         paths = tied(paths, hull, style.knot_mm / 1000, style.layer_mm / 1000)
-    leader = _leaders(roots, style, random)
+    leaders = random.choice(len(roots), max(1, len(roots) // style.clump_wisps), replace=False)
+    leader = leaders[cKDTree(roots[leaders]).query(roots)[1]]  # of each wisp's clump: the nearest
     paths = _clumped(paths, leader, style, random)
     normals = hull.normals(paths)
     paths = _curled(paths, normals, length, leader, style, random)
@@ -226,12 +227,6 @@ def _covers_face(paths: np.ndarray, style: HairStyle, ragged_m: np.ndarray) -> n
     azimuth = np.abs(np.degrees(np.arctan2(x, z)))
     low = style.fringe_mm / 1000 + ragged_m[:, None] + 0.10 * np.abs(x) * (style.comb == "parted")
     return (azimuth < _FACE_DEG) & (y < low) & (y > _CHIN_M)
-
-
-def _leaders(roots: np.ndarray, style: HairStyle, random: Random) -> np.ndarray:
-    """Return the index [W] of the wisp that leads each wisp's clump: the nearest leader on the scalp."""
-    leaders = random.choice(len(roots), max(1, len(roots) // style.clump_wisps), replace=False)
-    return leaders[cKDTree(roots[leaders]).query(roots)[1]]
 
 
 def _clumped(paths: np.ndarray, leader: np.ndarray, style: HairStyle, random: Random) -> np.ndarray:

@@ -143,7 +143,9 @@ def tail_paths(
     away = unit(knot - hull.middle)
     if kind == "bun":
         radius = random.uniform(0.024, 0.038)
-        first, second = _across(random.normal(0, 1, (count, 3)))
+        axes = unit(random.normal(0, 1, (count, 3)))
+        first = unit(np.cross(axes, np.where(np.abs(axes[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]])))
+        second = np.cross(axes, first)
         angle = 2 * np.pi * (random.uniform(0, 1, (count, 1, 1)) + 0.7 * share)
         shell = radius * random.uniform(0.8, 1, (count, 1, 1))
         around = np.cos(angle) * first[:, None] + np.sin(angle) * second[:, None]
@@ -178,13 +180,6 @@ def _braid(person_m: np.ndarray, side: int, count: int, random: Random) -> tuple
     thinner = (1 - 0.5 * rows)[None, :, None]
     away = (crossed + spread) * thinner
     return middle + away, unit(away)
-
-
-def _across(axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors [N, 3] each, orthogonal to the axes [N, 3] and to each other."""
-    axes = unit(axes)
-    first = unit(np.cross(axes, np.where(np.abs(axes[:, :1]) < 0.9, [[1.0, 0, 0]], [[0, 1.0, 0]])))
-    return first, np.cross(axes, first)
 
 
 def tied(paths: np.ndarray, hull: Hull, height_m: float, layer_m: float) -> np.ndarray:

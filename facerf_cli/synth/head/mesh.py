@@ -76,7 +76,7 @@ class HeadMesh:
     vertices, normals (unit) [V, 3]; triangles [F, 3] int64, counter-clockwise seen from outside, each within
     one part; part [V] uint8, an index into `PARTS`; uv [V, 2] in the texture of the part, row v = 0 at the
     top (skin: the face's UV map, continued beyond 0..1 over the rest of the head); tangents [V, 3] unit
-    along a strand of hair, zero elsewhere; label [V] uint8, an index into `labels.CLASSES`.
+    along a strand of hair, zero elsewhere; label [V] uint8, an index into `portrait.parse.CLASSES`.
     """
 
     vertices: np.ndarray

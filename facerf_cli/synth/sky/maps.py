@@ -1,7 +1,7 @@
 """Maps of `facerf envmap`, and their contact sheet: each map beside a white ball under it."""
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +50,8 @@ def write_envmaps(
     new = {path for path in maps if _is_to_be_made(path, maps[path], size_px, batch.overwrite)}
     sheet, journal = batch.output / SHEET, Journal(batch.output, "envmap")
     stays = batch.overwrite == "never" and sheet.exists()
-    is_shown_anew = not stays and (bool(new) or _is_older(sheet, maps))
+    is_old = not sheet.exists() or any(path.stat().st_mtime > sheet.stat().st_mtime for path in maps)
+    is_shown_anew = not stays and (bool(new) or is_old)
     if batch.overwrite == "changed":
         for path in [*sorted(new), *([sheet] if is_shown_anew else [])]:
             if refusal := journal.refusal(path):
@@ -62,12 +63,12 @@ def write_envmaps(
         if not batch.dry_run:
             pixels, _ = draw_sky(index, seed, size_px, kinds)
             write_exr(path, pixels, metadata={**facts, "Software": f"facerf {__version__}"})
-            journal.own(path)
+            journal.add_file(path)
         print(path, flush=True)
     if is_shown_anew:
         if not batch.dry_run:
             write_sheet(list(maps), sheet)
-            journal.own(sheet)
+            journal.add_file(sheet)
             log.info("%s: shows %d of %d maps", sheet, min(count, MOST_MAPS), count)
         print(sheet, flush=True)
 
@@ -78,10 +79,6 @@ def _is_to_be_made(path: Path, facts: Facts, width_px: int, overwrite: Overwrite
         return overwrite == "always" or not path.exists()
     header = read_header(path)
     return not (header and header.width_px == width_px and facts.items() <= header.metadata.items())
-
-
-def _is_older(sheet: Path, maps: Iterable[Path]) -> bool:
-    return not sheet.exists() or any(path.stat().st_mtime > sheet.stat().st_mtime for path in maps)
 
 
 def write_sheet(maps: Sequence[Path], sheet: Path) -> None:

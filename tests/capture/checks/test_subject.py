@@ -1,6 +1,5 @@
 """Each fault planted in a small stage and found, and nothing found where there is none."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -75,17 +74,6 @@ def test_a_camera_without_frames_is_one_finding(tmp_path: Path, sound: np.ndarra
     folder = write_egg_stage(tmp_path / "s", sound, cameras=[egg_camera(EGG_CAMERA), egg_camera("C1")])
     found = only(findings(folder))
     assert (found.check, found.camera, found.light) == ("missing", "C1", None)
-
-
-def test_files_of_no_lamp_are_counted_but_not_the_ambient_one(tmp_path: Path, sound: np.ndarray) -> None:
-    folder = write_egg_stage(tmp_path / "s", sound)
-    for name in ("L900", "ambient"):
-        write_exr(frame(folder, 0).with_stem(name), grey(sound[0] * 0.9))
-    found = only(findings(folder))
-    assert found.check == "extra" and found.figures["files"] == 1 and "L900" in found.words
-    stage = json.loads((folder / "stage.json").read_text())
-    (folder / "stage.json").write_text(json.dumps(stage | {"ignore": ["L900"]}))
-    assert not findings(folder)
 
 
 def test_a_frame_of_another_size_is_left_out(tmp_path: Path, sound: np.ndarray) -> None:

@@ -2,7 +2,6 @@
 
 import json
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -178,17 +177,8 @@ def test_basel_2017_is_read_in_metres_and_deviations(
 
 
 @pytest.mark.usefixtures("here")
-def test_the_landmarks_that_basel_2017_names_place_the_mesh(tmp_path: Path) -> None:
-    face = head(120, 120, turn_deg=4)  # finer, for a name lies on a vertex
-    source = read_basel(h5(tmp_path / "model.h5", face, face.mean * 0))
-    model = resample_model(source)
-    assert np.sqrt((off_mm(model, face) ** 2).mean()) < 1.0
-    assert model.identity.shape[0] == SHAPES and model.expression.shape[0] == EXPRESSIONS + 1
-
-
-@pytest.mark.usefixtures("here")
 def test_a_surface_that_ends_early_goes_on_as_the_built_in_face(tmp_path: Path) -> None:
-    whole = head(120, 120, turn_deg=4)
+    whole = head(120, 120, turn_deg=4)  # fine, because a named landmark lies on a vertex
     source = read_basel(h5(tmp_path / "face12.h5", whole, whole.mean * 0))
     away = (whole.mean - whole.landmarks[30]) @ rigid_alignment(LANDMARKS_M, whole.landmarks)[0]
 
@@ -200,6 +190,7 @@ def test_a_surface_that_ends_early_goes_on_as_the_built_in_face(tmp_path: Path) 
     model = resample_model(part)
     off = off_mm(model, whole)
     assert np.median(off) < 0.5 and off.max() < 12
+    assert len(model.identity) == SHAPES and len(model.expression) == EXPRESSIONS + 1
     moved = model.identity[0].norm(dim=-1)
     corners = moved.reshape(129, 129)[[0, 0, -1, -1], [0, -1, 0, -1]]
     assert 0.5 * moved.mean() < corners.mean() < 2 * moved.mean()
@@ -224,56 +215,19 @@ def test_h5py_is_an_extra(tmp_path: Path, monkeypatch: Patch) -> None:
     refused(FacerfError, "pip install 'facerf[face-models]'", read_basel, tmp_path / "model.h5")
 
 
-WRONG_MAT: dict[str, tuple[Callable[[dict[str, Any]], dict[str, Any]], str]] = {
-    "no basis": (lambda m: {key: value for key, value in m.items() if key != "shapePC"}, "shapePC"),
-    "a basis of another mesh": (
-        lambda m: {**m, "shapePC": np.zeros((9, 199))},
-        "pcaBasis is float64 of shape [9, 199]",
-    ),
-    "a structure": (lambda m: {**m, "shapeEV": {"a": 1}}, "not a Basel"),
-    "triangles beyond": (lambda m: {**m, "tl": m["tl"] + 1}, "does not have"),
-    "not finite": (lambda m: {**m, "shapeMU": m["shapeMU"] * np.nan}, "non-finite"),
-    "millimetres": (lambda m: {**m, "shapeMU": m["shapeMU"] / 1000}, "published unit"),
-}
-
-
 @pytest.mark.usefixtures("here")
-@pytest.mark.parametrize("case", WRONG_MAT)
-def test_what_is_not_basel_2009_is_refused_in_one_line(face: Head, tmp_path: Path, case: str) -> None:
-    change, message = WRONG_MAT[case]
-    path = written_mat(tmp_path / "a.mat", change(mat(face)))
-    refused(InputError, f"{path} ... {message}", import_face_model, path)
-
-
-def test_a_matrix_of_matlab_7_3_and_other_files_are_refused(tmp_path: Path) -> None:
-    with h5py.File(tmp_path / "a.mat", "w", userblock_size=512) as file:
-        file["shapeMU"] = [1.0]
-    with (tmp_path / "a.mat").open("r+b") as file:
-        file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
-    (tmp_path / "b.mat").write_bytes(b"no matrix at all" * 20)
-    for name in "ab":
-        refused(InputError, "not a Basel Face Model 2009", read_basel, tmp_path / f"{name}.mat")
-    refused(InputError, "no such file", read_basel, tmp_path / "c.mat")
+def test_what_is_not_basel_2009_is_refused_in_one_line(face: Head, tmp_path: Path) -> None:
+    for change in ({"shapePC": np.zeros((9, 199))}, {"shapeEV": {"a": 1}}):
+        path = written_mat(tmp_path / "a.mat", mat(face) | change)
+        refused(InputError, f"{path} ... not a Basel Face Model 2009", import_face_model, path)
 
 
 WRONG_H5: dict[str, tuple[dict[str, Any], str]] = {
-    "no expressions": (
-        {f"expression/model/{name}": None for name in ("mean", "pcaBasis", "pcaVariance")},
-        "it lacks expression/model",
-    ),
-    "text for numbers": ({"shape/model/mean": "text"}, "not a Basel"),
-    "a basis of another mesh": (
-        {"shape/model/pcaBasis": np.zeros((9, 199))},
-        "pcaBasis is float64 of shape",
-    ),
+    "no expressions": ({"expression/model/mean": None}, "it lacks expression/model"),
     "scaled already": ({"shape/model/pcaBasis": 7 * np.ones((10800, 199), "f4")}, "unit length"),
     "variance below zero": ({"shape/model/pcaVariance": -np.ones(199)}, "pcaVariance is negative"),
-    "triangles beyond": ({"shape/representer/cells": np.full((3, 9), 99999)}, "does not have"),
-    "not finite": ({"shape/model/mean": np.full(10800, np.nan)}, "non-finite"),
     "a link to another file": ({"shape/model/mean": h5py.ExternalLink("b.h5", "/a")}, "2017"),
-    "a link in circles": ({"shape/model/mean": h5py.SoftLink("/shape/model/mean")}, "2017"),
     "names of another kind": ({"metadata/landmarks/json": "[1, 2]"}, "not a Basel Face Model 2017"),
-    "metres": ({"shape/model/mean": np.zeros(10800)}, "published unit"),
 }
 
 

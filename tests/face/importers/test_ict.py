@@ -3,22 +3,19 @@
 import io
 import tarfile
 import zipfile
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 from scipy.spatial import cKDTree
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.importers.basel import _LANDMARKS_2009, _LANDMARKS_2017
 from facerf_cli.face.importers.ict import LANDMARK_IDS, VERTICES
-from facerf_cli.face.importers.resample import import_face_model, resample_model, rigid_alignment
+from facerf_cli.face.importers.resample import import_face_model, rigid_alignment
 from facerf_cli.face.importers.source import SourceModel
-from facerf_cli.face.morphable import MorphableModel, load_face_model, save_face_model
-from facerf_cli.face.topology import GRID, LANDMARKS_M, grid_triangles, landmark_weights
+from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.face.topology import LANDMARKS_M, grid_triangles, landmark_weights
 from tests.refusals import refused
 
 NEUTRAL = "ICT-FaceKit-master/FaceXModel/generic_neutral_mesh.obj"
@@ -60,18 +57,6 @@ def test_landmarks_stay_where_they_were(ict):
     assert off_mm.mean() < 0.15
 
 
-@pytest.mark.parametrize("named", [tuple(_LANDMARKS_2009), tuple(_LANDMARKS_2017.values())])
-def test_the_landmarks_that_basel_names_place_the_others(ict_source: SourceModel, named: tuple[int, ...]):
-    """Of a person that the built-in model has not seen, against the landmarks of the mesh's authors."""
-    person = ict_source.mean + 1.5 * ict_source.identity[0] - 1.5 * ict_source.identity[1]
-    known = {number: person[LANDMARK_IDS[number]] for number in named}
-    model = resample_model(replace(ict_source, mean=person, known=known))
-    rotation, translation = rigid_alignment(np.stack(list(known.values())), LANDMARKS_M[list(named)])
-    truth = person[LANDMARK_IDS] @ rotation.T + translation
-    off_mm = 1000 * np.linalg.norm(model.landmarks(model.mean[None])[0].numpy() - truth, axis=-1)
-    assert off_mm.mean() < 1.3 and off_mm.max() < 3.0
-
-
 def test_shapes_move_the_landmarks_as_they_did(ict):
     source, model = ict
     corners, weights = landmark_weights()
@@ -83,15 +68,6 @@ def test_shapes_move_the_landmarks_as_they_did(ict):
         original = theirs[:, LANDMARK_IDS] @ rotation.T
         assert np.abs(carried - original).max() < 0.1 * np.abs(original).max()
     assert "jawOpen" in model.expression_names and "USC" in model.licence
-
-
-def test_a_carried_model_survives_its_file(ict, tmp_path):
-    save_face_model(tmp_path / "ict.npz", ict[1])
-    again = load_face_model(tmp_path / "ict.npz")
-    assert again.name == "ict-facekit" and again.mean.shape == (GRID * GRID, 3)
-    assert (again.identity - ict[1].identity).abs().max() < 2e-5
-    assert (again.expression - ict[1].expression).abs().max() < 2e-5
-    assert torch.equal(again.mean, ict[1].mean)
 
 
 def zipped(path: Path, **members: bytes) -> Path:
@@ -126,15 +102,9 @@ def noise(length: int) -> bytes:
     return np.random.default_rng(0).bytes(length)
 
 
-def cut(path: Path) -> Path:
-    path.write_bytes(path.read_bytes()[:50_000])
-    return path
-
-
 HOSTILE = {
     "not there": (lambda t: t / "none.zip", "use ICT-FaceKit's folder"),
     "an empty folder": (lambda t: t, "it lacks files of FaceXModel"),
-    "no neutral mesh": (lambda t: zipped(t / "a.zip", jawOpen=obj()), "it lacks files of FaceXModel"),
     "a short mesh": (
         lambda t: zipped(t / "a.zip", generic_neutral_mesh=obj(10), identity000=obj(), jawOpen=obj()),
         "10 vertices",
@@ -149,16 +119,11 @@ HOSTILE = {
         lambda t: zipped(t / "a.zip", generic_neutral_mesh=obj(VERTICES - 1) + b"v nan 0 0\n"),
         "a.zip",
     ),
-    "a surface that is one point": (
-        lambda t: zipped(t / "a.zip", generic_neutral_mesh=obj(), identity000=obj(), jawOpen=obj()),
-        "largest side is 0 mm",
-    ),
     "a bomb": (lambda t: zipped(t / "a.zip", generic_neutral_mesh=bytes(65 << 20)), "too large"),
     "a damaged xz": (
         lambda t: damaged(tarred(t / "a.tar.xz", "w:xz", noise(200_000)), 0.5),
         "not ICT-FaceKit",
     ),
-    "a cut tar": (lambda t: cut(tarred(t / "a.tar", "w", noise(200_000))), "not ICT-FaceKit"),
 }
 
 

@@ -27,14 +27,14 @@ from facerf_cli.synth.bank import Files, people, portrait_samples
 from facerf_cli.synth.bank.people import PeopleBankSettings, add_people, photos_in, read_photo
 from facerf_cli.synth.bank.portrait_samples import (
     PortraitSample,
-    StoredSquares,
+    PortraitSquares,
     StoredView,
     draw_targets,
     load_view,
 )
 from facerf_cli.synth.bank.proxies import seen_path
+from facerf_cli.synth.person import SyntheticPerson
 from facerf_cli.synth.renderer import albedo_of, images_under
-from facerf_cli.synth.subjects import Subject
 from tests.refusals import refused
 from tests.synth.conftest import SMALL, backgrounds
 
@@ -52,7 +52,7 @@ def view(folder: Path) -> StoredView:
 
 
 def drawn(folder: Path, seed: int) -> PortraitSample:
-    stored = StoredSquares(folder, backgrounds(), {"licence": "MIT"})
+    stored = PortraitSquares(folder, backgrounds(), {"licence": "MIT"})
     return stored.draw([0], 3, torch.Generator().manual_seed(seed))
 
 
@@ -62,23 +62,23 @@ def test_images_are_linear_in_light_and_looks_differ_in_albedo(view: StoredView)
     single = torch.eye(14)[:, :, None].expand(-1, -1, 3)
     weights = torch.zeros(1, 14, 3)
     weights[0, [2, 7]] = torch.tensor([[1.0, 0.5, 0.2], [0.3, 0.3, 2.0]])
-    images = images_under(view.portrait, view.looks[0], torch.cat([single, weights]))
+    images = images_under(view.baked, view.looks[0], torch.cat([single, weights]))
     summed = torch.einsum("lc,lcij->cij", weights[0], images[:14])
     torch.testing.assert_close(images[14], summed, rtol=1e-3, atol=1e-4)
-    (first, normals), (second, again) = (albedo_of(view.portrait, look) for look in view.looks)
+    (first, normals), (second, again) = (albedo_of(view.baked, look) for look in view.looks)
     assert (first - second).abs().mean() > 0.01 and torch.equal(normals, again)
     assert first.min() >= 0 and first.max() < 1
-    assert first[:, view.portrait.alpha == 0].max() < 0.05  # alpha is in 256 steps
-    landmarks = view.portrait.landmarks_px[:68]
+    assert first[:, view.baked.alpha == 0].max() < 0.05  # alpha is in 256 steps
+    landmarks = view.baked.landmarks_px[:68]
     extent = float((landmarks.amax(0) - landmarks.amin(0)).max())
     assert extent == pytest.approx(SIDE_PX / SIDES, rel=0.25)  # four deviations
-    assert 0.15 < view.portrait.alpha.mean() < 0.9
+    assert 0.15 < view.baked.alpha.mean() < 0.9
 
 
 def test_squares_are_parts_of_the_photo_and_many_targets_are_lit_from_behind() -> None:
     """Landmarks in a square lie where its crop of the photo has them."""
     landmarks = np.random.default_rng(0).uniform(-0.07, 0.07, (68, 3))
-    subject = cast(Subject, SimpleNamespace(landmarks_world=landmarks))
+    subject = cast(SyntheticPerson, SimpleNamespace(landmarks_world=landmarks))
     scales = np.array([1.6, 3.0, 6.5])
     drawn = people._draw_views(subject, scales, np.random.default_rng(1), PeopleBankSettings())
     points = torch.from_numpy(landmarks).float()
@@ -99,13 +99,11 @@ def test_squares_are_parts_of_the_photo_and_many_targets_are_lit_from_behind() -
 
 def test_what_is_seen_fits_the_truth(folder: Path, view: StoredView) -> None:
     seen = load_file(seen_path(folder / "00001_0.safetensors"))
-    person, alpha = (
-        x[: int(seen["rows"])] for x in (1 - seen["classes"][0].float() / 255, view.portrait.alpha)
-    )
+    person, alpha = (x[: int(seen["rows"])] for x in (1 - seen["classes"][0].float() / 255, view.baked.alpha))
     both = torch.minimum(person, alpha).sum() / torch.maximum(person, alpha).sum()
     assert both > 0.7
-    assert seen["visible"].shape == (14, len(view.portrait.alpha) // 2, len(view.portrait.alpha) // 2)
-    _, normals = albedo_of(view.portrait, view.looks[0])
+    assert seen["visible"].shape == (14, len(view.baked.alpha) // 2, len(view.baked.alpha) // 2)
+    _, normals = albedo_of(view.baked, view.looks[0])
     skin = seen["classes"][SKIN] > 230
     alike = (F.normalize(normals, dim=0) * seen["normals"].float()).sum(0)[skin]
     assert alike.mean() > 0.8
@@ -115,7 +113,7 @@ def test_what_is_seen_fits_the_truth(folder: Path, view: StoredView) -> None:
 def test_what_is_seen_lies_where_the_truth_does(folder: Path, view: str) -> None:
     """In the view's own square, not in one of its own: moved by 3 pixels the classes fit worse."""
     path = folder / f"{view}.safetensors"
-    layers, truth = load_file(seen_path(path)), load_view(path).portrait.classes[..., SKIN]
+    layers, truth = load_file(seen_path(path)), load_view(path).baked.classes[..., SKIN]
     truth[int(layers["rows"]) :] = 0
     seen = layers["classes"][SKIN].float() / 255
     moves = [(x, y) for x in (-3, 0, 3) for y in (-3, 0, 3)]
@@ -141,7 +139,7 @@ def test_a_photo_that_ends_shows_its_last_row_beyond(folder: Path) -> None:
     """The person below counts nothing; nothing of it is seen, but for the proxy."""
     rows, side = 163, 192  # of the first square
     assert int(load_file(seen_path(folder / "00001_0.safetensors"))["rows"]) == rows
-    stored = StoredSquares(folder, backgrounds(), {"licence": "MIT"})
+    stored = PortraitSquares(folder, backgrounds(), {"licence": "MIT"})
     sample = stored.draw([0], 3, torch.Generator().manual_seed(1), side)
     image = sample.inputs.image
     beyond, last = image[..., rows:, :], image[..., rows - 1 : rows, :]
@@ -177,7 +175,7 @@ def test_the_network_sees_shaded_skin_in_the_colour_of_lit_skin(
 
 def test_squares_show_what_those_of_photos_do() -> None:
     landmarks = np.random.default_rng(0).uniform(-0.07, 0.07, (68, 3))
-    subject = cast(Subject, SimpleNamespace(landmarks_world=landmarks))
+    subject = cast(SyntheticPerson, SimpleNamespace(landmarks_world=landmarks))
     settings, random = PeopleBankSettings(), np.random.default_rng(1)
     views = [view for _ in range(60) for view in people._draw_cameras(subject, random, settings)]
     assert 0.2 < np.mean([view.rows < settings.photo_px for view in views]) < 0.45
@@ -225,7 +223,7 @@ def test_finished_people_are_kept_and_squares_added(tmp_path: Path, monkeypatch:
     for count, squares in ((2, False), (3, False), (3, True), (3, True)):
         add_people(tmp_path, ["a", "b"], range(count), 1, 0, replace(SMALL, with_squares=squares))
     assert made == [0, 1, 2, 0, 1, 2] and len(list(tmp_path.iterdir())) == 9
-    refused(InputError, "no portraits", StoredSquares, tmp_path, backgrounds(), {})
+    refused(InputError, "no squares", PortraitSquares, tmp_path, backgrounds(), {})
     refused(InputError, "no photos", photos_in, tmp_path / "empty")
 
 

@@ -1,6 +1,6 @@
 """Training crops for the Parsing Network: stored photos of synthetic people, altered for every sample.
 
-A stored photo (`portraits.py`) is mirrored or not, turned, scaled and shifted in the crop, over a background,
+A stored photo (`people.py`) is mirrored or not, turned, scaled and shifted in the crop, over a background,
 sometimes with another person in it or something in front of the face. A camera then degrades it. Wide
 variation lets training on synthetic people serve for real ones (Wood et al., *Fake it till you make it*,
 2021).
@@ -110,7 +110,7 @@ class FeatureWarp:
 
 
 @dataclass(frozen=True)
-class PortraitCrops(Batch):
+class ParsingCrops(Batch):
     """Crops of B photos as a screen shows them, and what the Parsing Network should see in them."""
 
     crops: Tensor  # [B, 3, S, S] in 0..1
@@ -122,7 +122,7 @@ class PortraitCrops(Batch):
     present: Tensor  # [B] whether there is a person
 
 
-class StoredPortraits:
+class ParsingPhotos:
     """Photos of a bank, read when they are drawn."""
 
     def __init__(self, folder: Path, backgrounds: Tensor, provenance: dict[str, Any]) -> None:
@@ -133,7 +133,7 @@ class StoredPortraits:
     def people(self, held_out: int) -> tuple[list[int], list[int]]:
         return split_people(len(self.photos), held_out)
 
-    def draw(self, people: Sequence[int], side: int, generator: torch.Generator) -> PortraitCrops:
+    def draw(self, people: Sequence[int], side: int, generator: torch.Generator) -> ParsingCrops:
         """Draw one crop [1, ...] of one of some people."""
         photo = self._photo(people, generator)
         headless = torch.rand((), generator=generator) < _HEADLESS
@@ -164,7 +164,7 @@ class StoredPortraits:
         return photo.mirrored() if torch.rand((), generator=generator) < 0.5 else photo
 
     def _composed(
-        self, crop: PortraitCrops, people: Sequence[int], side: int, generator: torch.Generator
+        self, crop: ParsingCrops, people: Sequence[int], side: int, generator: torch.Generator
     ) -> Tensor:
         """Place the crop's person over a background, and perhaps before another person: [3, side, side]."""
         image = background(self.backgrounds, side, generator)
@@ -214,7 +214,7 @@ def _draw_crop_aside(photo: Photo, generator: torch.Generator) -> Similarity:
     return Similarity.around(_middle(photo), side_px, 0, torch.cat([x, uniform(-0.35, 0.2, 1)]))
 
 
-def _cropped(photo: Photo, crop: Similarity, side: int, warp: FeatureWarp | None = None) -> PortraitCrops:
+def _cropped(photo: Photo, crop: Similarity, side: int, warp: FeatureWarp | None = None) -> ParsingCrops:
     """Resample a photo, with its features moved by `warp`: the image is radiance times alpha over black.
 
     Below the stored photo its lowest row repeats; that is correct where it shows a garment. Beside it,
@@ -232,7 +232,7 @@ def _cropped(photo: Photo, crop: Similarity, side: int, warp: FeatureWarp | None
     lost = (beside | below) & (image[3] > 0)
     landmarks = crop.in_crop(landmarks_px)
     known = ((landmarks > 0.01) & (landmarks < 0.99)).all(-1)  # false for NaN
-    return PortraitCrops(
+    return ParsingCrops(
         crops=image[:3][None],
         alpha=image[3][None],
         label=label.long()[None],
@@ -254,7 +254,7 @@ def _middle(photo: Photo) -> Tensor:
     return (face.amax(0) + face.amin(0)) / 2
 
 
-def _without_person(crop: PortraitCrops) -> PortraitCrops:
+def _without_person(crop: ParsingCrops) -> ParsingCrops:
     return replace(
         crop,
         crops=torch.zeros_like(crop.crops),
@@ -265,7 +265,7 @@ def _without_person(crop: PortraitCrops) -> PortraitCrops:
     )
 
 
-def _bordered(crop: PortraitCrops, generator: torch.Generator) -> PortraitCrops:
+def _bordered(crop: ParsingCrops, generator: torch.Generator) -> ParsingCrops:
     """End the photo somewhere in the crop; its border repeats beyond, like in `parse.Square.cut`."""
     side = crop.alpha.shape[-1]
     ends = [int(float(end) * side) for end in Uniform(generator)(0, 0.18, 4)]
@@ -281,7 +281,7 @@ def _bordered(crop: PortraitCrops, generator: torch.Generator) -> PortraitCrops:
     )
 
 
-def _with_decoys(image: Tensor, crop: PortraitCrops, generator: torch.Generator) -> Tensor:
+def _with_decoys(image: Tensor, crop: ParsingCrops, generator: torch.Generator) -> Tensor:
     """Lay shapes with the person's own colours and texture over a background [3, S, S].
 
     Behind real people stand things as dark as their hair and as white as their collars. A decoy shows the

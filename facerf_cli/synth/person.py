@@ -30,7 +30,7 @@ _HELD, _HELD_SHARES, _EARRINGS_SHARE = ("none", "hand", "microphone"), (0.89, 0.
 
 
 @dataclass(frozen=True, eq=False)
-class Subject:
+class SyntheticPerson:
     """Person in the stage: mesh in world space (m) and materials."""
 
     mesh: HeadMesh
@@ -38,12 +38,14 @@ class Subject:
     head_to_world: Tensor  # [3, 3]
     face_vertices: Tensor  # [GRID * GRID, 3] of the canonical mesh, head frame
     landmarks_world: np.ndarray  # [68, 3], m
-    more_landmarks_world: dict[str, list[float]]  # of `truth.more_landmarks`, m
+    more_landmarks_world: dict[str, list[float]]  # of `views.more_landmarks`, m
     traits: dict[str, Any]
     lenses: HeadMesh | None = None  # of glasses, in world space
 
 
-def draw_subject(model: MorphableModel, index: int, seed: int, size_px: int, arms: bool = False) -> Subject:
+def draw_person(
+    model: MorphableModel, index: int, seed: int, size_px: int, arms: bool = False
+) -> SyntheticPerson:
     """Draw subject number `index`, a function of (model, seed, index); `size_px` sets only its resolution.
 
     It reaches to the chest, or with whole `arms` to the hips.
@@ -83,7 +85,7 @@ def draw_subject(model: MorphableModel, index: int, seed: int, size_px: int, arm
         "pose_deg": pose_deg.round(3).tolist(),
         "gaze_deg": gaze.round(3).tolist(),
     }
-    return Subject(
+    return SyntheticPerson(
         mesh,
         appearance,
         head_to_world,

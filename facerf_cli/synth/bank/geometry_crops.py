@@ -33,7 +33,7 @@ _SHIFT, _SCALE = (0.1, 0.03), 0.07
 
 
 @dataclass(frozen=True)
-class FaceCrops(Batch):
+class GeometryCrops(Batch):
     """Crops of B faces as a camera shows them, and the fit that the network should find in them."""
 
     crops: Tensor  # [B, 3, S, S]
@@ -76,7 +76,7 @@ class _Face:
         return _Face(self.path, points_px, self.centre_px * flip[:2] + width, self.side_px, fit)
 
 
-class RenderedFaces:
+class GeometryPhotos:
     """Draws crops of the faces in a bank's photos."""
 
     def __init__(self, folder: Path, backgrounds: Tensor, provenance: dict[str, Any]) -> None:
@@ -94,7 +94,7 @@ class RenderedFaces:
         x, y, z = torch.stack(shifts_m).mean(0).tolist()
         return x, y, z
 
-    def draw(self, person: int, side: int, generator: torch.Generator) -> FaceCrops:
+    def draw(self, person: int, side: int, generator: torch.Generator) -> GeometryCrops:
         """Draw one crop of a person, [1, 3, side, side], with its fit."""
         faces = self.faces[person]
         face = faces[int(torch.randint(len(faces), (), generator=generator))]
@@ -108,7 +108,7 @@ class RenderedFaces:
         rotation, translation_m = crop.pose(
             face.centre_px, face.side_px, fit["rotation"], fit["translation_m"]
         )
-        return FaceCrops(
+        return GeometryCrops(
             _CAMERA.take(image, image.mean(), generator)[None],
             side * crop.in_crop(face.points_px)[None],
             rotation[None],
