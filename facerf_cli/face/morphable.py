@@ -122,8 +122,8 @@ def floats(arrays: Mapping[str, np.ndarray], key: str, shape: tuple[int | None, 
     expected = (len(array), *shape[1:]) if shape[0] is None else shape
     if array.shape != expected or (shape[0] is None and len(array) > _MAX_COEFFICIENTS):
         raise ValueError(f"{key} has shape {array.shape}, not {shape}")
-    tensor = torch.from_numpy(array.astype(np.float32))
-    if not tensor.isfinite().all():
+    tensor = torch.from_numpy(array).float()  # far faster than numpy from half precision
+    if not tensor.sum().isfinite():
         raise ValueError(f"{key} contains non-finite values")
     return tensor
 
