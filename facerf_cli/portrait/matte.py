@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 
 import numpy as np
 import torch
@@ -46,6 +47,7 @@ _HOLE = 0.12  # side of holes that are filled, in heights of the head
 _BODY_SIDES, _BODY_BELOW = 5.5, 1.6  # first square for the body network, in heights of the head
 _CLAIM, _LEAD = 0.6, 0.5  # least coverage of a seed, and largest fraction of it that another body may have
 _REACH_PX = 2  # of the linear functions of colour for enlarging a matte
+_TILE_PX = 64  # side of the parts of a matte that are processed at once: they stay in the processor's cache
 _SMOOTHNESS = 1e-5  # variance of colours, sRGB in 0..1, below which the matte is smoothed
 _COLOURS_PX = 512  # longest side at which colours are estimated
 _COLOUR_REACH = (0.03, 0.006)  # of the successive means of colours, in longest sides
@@ -295,6 +297,26 @@ def enlarge_matte(alpha: np.ndarray, image: np.ndarray, photo_srgb: np.ndarray) 
     Fast guided filter (He et al., *Guided image filtering*, 2013; He and Sun, 2015): linear functions of the
     colour around each pixel are fitted at the small size and applied at the large one.
     """
+    margin = 2 * _REACH_PX
+    maps = np.concatenate([np.zeros((3, *alpha.shape), np.float32), alpha[None]])  # where alpha is constant
+    for row, column in product(*(range(0, length, _TILE_PX) for length in alpha.shape)):
+        top, left = max(0, row - margin), max(0, column - margin)
+        around = np.s_[top : row + _TILE_PX + margin, left : column + _TILE_PX + margin]
+        if alpha[around].min() < alpha[around].max():
+            fitted_maps = _linear_functions(alpha[around], image[around])
+            tile = maps[:, row : row + _TILE_PX, column : column + _TILE_PX]
+            tile[:] = fitted_maps[:, row - top :, column - left :][:, : tile.shape[1], : tile.shape[2]]
+    size = photo_srgb.shape[:2]
+    matte = np.empty(size, np.float32)
+    for rows in strips(size):
+        lines = enlarged(maps, size, rows)
+        colours = photo_srgb[rows].transpose(2, 0, 1) / np.float32(255)
+        matte[rows] = ((lines[:3] * colours).sum(0) + lines[3]).clip(0, 1)
+    return matte
+
+
+def _linear_functions(alpha: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """Return slopes and offset [4, h, w] of the linear functions of colour; see `enlarge_matte`."""
     mean = partial(box_means, reach=_REACH_PX)
     colour, value = mean(image), mean(alpha[..., None])
     covariance, common = (
@@ -303,14 +325,7 @@ def enlarge_matte(alpha: np.ndarray, image: np.ndarray, photo_srgb: np.ndarray) 
     )
     slope = np.linalg.solve(covariance + _SMOOTHNESS * np.eye(3, dtype=np.float32), common)  # [h, w, 3, 1]
     offset = value - (slope * colour[..., None]).sum(-2)
-    maps = np.concatenate([mean(slope)[..., 0], mean(offset)], -1).transpose(2, 0, 1)
-    size = photo_srgb.shape[:2]
-    matte = np.empty(size, np.float32)
-    for rows in strips(size):
-        lines = enlarged(maps, size, rows)
-        colours = photo_srgb[rows].transpose(2, 0, 1) / np.float32(255)
-        matte[rows] = ((lines[:3] * colours).sum(0) + lines[3]).clip(0, 1)
-    return matte
+    return np.concatenate([mean(slope)[..., 0], mean(offset)], -1).transpose(2, 0, 1)
 
 
 def solid(matte: np.ndarray, loose: np.ndarray) -> np.ndarray:
