@@ -374,7 +374,7 @@ class Person:
             raise ValueError(f"texture has shape {list(texture.shape)}, not {list(self.texture.shape)}")
         if not isinstance(field, Field):
             raise UsageError(f"with_texture: not supported by {self.kind}; use reflectance='field'")
-        field = replace(field, face=replace(field.face, texture=planes))
+        field = replace(field, face=replace(field.face, texture=planes), known=None)
         whole = replace(reflectance, field=field) if isinstance(reflectance, PortraitField) else field
         return replace(self, reflectance=whole)
 

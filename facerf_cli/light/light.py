@@ -32,7 +32,7 @@ Rgb = tuple[float, float, float]
 WHITE_K = 6504.0  # correlated colour temperature of D65
 _UNIT = 1e-3  # tolerance of the length of a unit direction
 _APART_DEG, _MOST_A_SIDE = 6.0, 6  # spacing and number of samples along a panel's side, seen from the face
-_UNIFORM = 24  # samples of uniform light
+UNIFORM_LIGHTS = 24  # samples of uniform light
 _NEAREST_M = 0.05  # distance below which irradiance stops growing
 _FULL_CONE = 0.8  # fraction of a spot's cone with full irradiance, which then falls to 0
 _WIDEST_DEG = 36.0  # angular side of a light from which its shadows have no hard edges
@@ -339,8 +339,8 @@ class PointLights:
 def far_samples(light: StudioLight) -> tuple[Tensor, Tensor]:
     """Return a far light's sample directions [n, 3] and weights [n]; a surface that faces it receives 1."""
     if light.azel_deg is None:
-        weight = 4 / _UNIFORM  # the mean of a clamped cosine over the sphere is 1 / 4
-        return rig_directions(_UNIFORM), torch.full((_UNIFORM,), weight)
+        weight = 4 / UNIFORM_LIGHTS  # the mean of a clamped cosine over the sphere is 1 / 4
+        return rig_directions(UNIFORM_LIGHTS), torch.full((UNIFORM_LIGHTS,), weight)
     middle = azel_to_direction(*light.azel_deg)
     if light.size_deg == 0:  # equal to a single light to the last bit
         return middle[None], torch.ones(1)
@@ -374,9 +374,21 @@ def is_narrow(directions: Tensor) -> bool:
     return bool((directions @ middle).min() > math.cos(math.radians(_WIDEST_DEG / 2**0.5)))
 
 
-def is_of_rig(directions: Tensor, lights: int = _UNIFORM) -> Tensor:
+def is_of_rig(directions: Tensor, lights: int = UNIFORM_LIGHTS) -> Tensor:
     """Return which directions [N, 3] belong to a rig; by default to the samples of uniform light."""
     return (directions[:, None] == rig_directions(lights)).all(-1).any(-1)
+
+
+def uniform_part(directions: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Find uniform light, of any rgb [M, 3], in M sums, rgb weights [M, L, 3], of lights [L, 3].
+
+    Return a mask [L] of the other lights, and that rgb, which is 0 without uniform light.
+    """
+    rest = ~is_of_rig(directions)
+    of_rig = weights[:, ~rest].detach()
+    if of_rig.shape[1] != UNIFORM_LIGHTS or directions.requires_grad or (of_rig != of_rig[:, :1]).any():
+        return torch.ones_like(rest), weights.new_zeros(len(weights), 3)
+    return rest, weights[:, ~rest].sum(1) / 4
 
 
 def intensity_of(light: StudioLight) -> Tensor:

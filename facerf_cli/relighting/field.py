@@ -14,7 +14,7 @@ from facerf_cli.baselines.base import Reflectance
 from facerf_cli.face.head import FaceTexture
 from facerf_cli.face.topology import interior_texture, region_mask
 from facerf_cli.light.estimate import LightEvidence
-from facerf_cli.light.light import PointLights
+from facerf_cli.light.light import UNIFORM_LIGHTS, PointLights
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.network.base import mixed_precision
 from facerf_cli.network.inputs import is_grey, without_cast
@@ -30,9 +30,22 @@ from facerf_cli.run.threads import count, in_threads
 
 _LIGHTS_ON_CPU = 4  # per batch: more leave the processor's cache and are slower
 _LIGHT_SIDE = 128  # texels of the texture on which light is estimated
-_UNIFORM_LIGHTS = 32  # lights that approximate uniform light
 _DETAIL_PX, _VISIBLE = 4.0, 0.3  # standard deviation of the blur of detail, in texels; least visibility
 SEEN_WELL = 0.9  # visibility above which a small texel shows the photo's colour
+
+
+@dataclass(frozen=True, eq=False)
+class Predicted:
+    """What the network predicts of a face: its code, and textures [K, 3, T, T] under lights [K, 3]."""
+
+    encoded: Any
+    directions: Tensor
+    textures: Tensor
+
+    def index(self, lights: Tensor) -> Tensor:
+        """Return the numbers [L] of lights [L, 3] among these, -1 for others."""
+        same = (lights[:, None] == self.directions).all(-1)
+        return torch.where(same.any(1), same.int().argmax(1), -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +59,7 @@ class Field:
     remove_shade_colour: bool = False  # whether the network sees the face `without_colour_of_shade`
     balance: WhiteBalance | None = None
     detail: Tensor | None = None  # factor [3, T, T] that restores detail (`with_detail`)
+    known: Predicted | None = None  # of this face; it is not predicted again
 
     def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
         """Return textures [M, 3, T, T] under M sums, [M, L, 3], of lights [L, 3]; see `Reflectance`."""
@@ -60,25 +74,40 @@ class Field:
         'Network Architecture'). The encoder runs once per field, the decoder once per light.
         """
         network, face, device = self._network, self.face, self.models.device
-        encoded = self._encode() if self.has_gradients else self._encoded
+        known = None if self.has_gradients or lights.requires_grad else self.known
+        encoded = known.encoded if known else self._encode() if self.has_gradients else self._encoded
         normals = face.normals if turn is None else torch.einsum("dc,cij->dij", turn, face.normals)
         normals, grey = normals[None].to(device), is_grey(face.texture)
 
-        def decoded(batch: Tensor) -> Tensor:
+        def predicted(batch: Tensor) -> Tensor:
             with mixed_precision(device, self.bf16):
                 olats = network.decode(encoded, normals, batch[None].to(device))[0]
             olats = olats.float().cpu()
-            olats = olats.mean(1, keepdim=True).expand_as(olats) if grey else olats
+            return olats.mean(1, keepdim=True).expand_as(olats) if grey else olats
+
+        def decoded(batch: Tensor) -> Tensor:
+            if known is None or turn is not None:
+                olats = predicted(batch)
+            else:
+                number = known.index(batch)
+                olats, new = known.textures[number], number < 0
+                if new.any():
+                    olats[new] = predicted(batch[new])
             olats = self.quotient.corrected(olats) if self.quotient else olats
             olats = olats if self.detail is None else olats * self.detail
             return olats if self.balance is None else olats * self.balance.gain[:, None, None]
 
         yield from in_threads(decoded, torch.split(lights, self._batch(len(lights))))
 
+    def predict(self, lights: Tensor) -> Predicted:
+        """Predict the face under lights [L, 3], to keep the result."""
+        return Predicted(self._encoded, lights, torch.cat(list(self.olats(lights))))
+
     def small_under_uniform_light(self) -> Tensor:
         """Return the face's small texture [3, t, t] under uniform white light."""
-        rig, share = rig_directions(_UNIFORM_LIGHTS), 1 / _UNIFORM_LIGHTS
-        return replace(self, face=shrunk(self.face)).relit(rig, torch.full((1, _UNIFORM_LIGHTS, 3), share))[0]
+        rig, share = rig_directions(UNIFORM_LIGHTS), 1 / UNIFORM_LIGHTS
+        small = replace(self, face=shrunk(self.face), known=None)
+        return small.relit(rig, torch.full((1, UNIFORM_LIGHTS, 3), share))[0]
 
     def with_detail(self, uniform: Tensor) -> "Field":
         """Return the field with the detail of the texture that the network loses (`detail.py`).
@@ -154,11 +183,10 @@ def photo_evidence(face: FaceTexture, keep_eyes: bool = False) -> LightEvidence:
     return evidence
 
 
-def shrunk(face: FaceTexture) -> FaceTexture:
-    """Return the texture at the size at which light is estimated."""
-    side = (_LIGHT_SIDE, _LIGHT_SIDE)
+def shrunk(face: FaceTexture, side: int = _LIGHT_SIDE) -> FaceTexture:
+    """Return the texture at another side, by default that at which light is estimated."""
     fields = torch.cat([face.texture, face.visible[None], face.normals])[None]
-    small = F.interpolate(fields, side, mode="area")[0]
+    small = F.interpolate(fields, (side, side), mode="area")[0]
     return FaceTexture(small[:3], small[3], F.normalize(small[4:], dim=0))
 
 

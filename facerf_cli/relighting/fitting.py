@@ -126,9 +126,11 @@ def reflectance_of(
 
     def face_field() -> tuple[SourceLight | None, Field]:
         source = None if network_alone else source_light(models, head.face, steady.light if steady else None)
-        quotient = source.quotient if source else None
-        field = Field(models, head.face, quotient, remove_shade_colour=source is not None)
-        field = field.with_detail(source.uniform) if source else field
+        if source:
+            field = Field(models, head.face, source.quotient, remove_shade_colour=True, known=source.known)
+            field = field.with_detail(source.uniform)
+        else:
+            field = Field(models, head.face)
         if steady or white_balance is None:
             return source, replace(field, balance=steady.balance if steady else None)
         uniform = source.uniform if source else field.small_under_uniform_light()

@@ -26,16 +26,24 @@ from facerf_cli.light.estimate import (
     key_light_error,
     refine_light,
 )
+from facerf_cli.light.light import UNIFORM_LIGHTS
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.network.features import FeatureNetwork
 from facerf_cli.network.inputs import exposure_of, resize
 from facerf_cli.portrait.correction import Quotient
 from facerf_cli.relighting import BalanceMode
-from facerf_cli.relighting.field import SEEN_WELL, Field, balance_of, photo_evidence, shrunk, weighted_sum
-from facerf_cli.relighting.models import Models
+from facerf_cli.relighting.field import (
+    SEEN_WELL,
+    Field,
+    Predicted,
+    balance_of,
+    photo_evidence,
+    shrunk,
+    weighted_sum,
+)
+from facerf_cli.relighting.models import TEXTURE_SIDE, Models
 from facerf_cli.relighting.white import without_baked_in
 
-_AMBIENT_LIGHTS = 32  # lights of the rig for ambient light
 _RINGS_DEG = (14.0, 6.0)  # rings of the search for the key light, each around the best direction so far
 _RING = 6  # directions per ring
 _ONE_KEY = 0.8  # fraction of the key light in a photo's light above which it may be the only light
@@ -47,36 +55,43 @@ _TINY = 1e-12  # avoids divisions by 0
 class SourceLight:
     """Estimated light of a photo, key light first, and the field's ratio image under it.
 
-    `uniform` [3, t, t] is the small face under uniform white light.
+    `uniform` [3, t, t] is the small face under uniform white light. `known` is what the network predicts of
+    the face under each light of that; None if its texture is larger than usual.
     """
 
     light: RigLight
     quotient: Quotient
     uniform: Tensor
+    known: Predicted | None
 
 
 @torch.no_grad()
 def source_light(models: Models, face: FaceTexture, held: RigLight | None = None) -> SourceLight:
-    """Estimate the light of a photo on small textures, and the ratio image that corrects the field to it.
+    """Estimate the light of a photo, and the ratio image that corrects the field to it, on small textures.
 
     If a light is `held` over the frames of a shot (`light_of_frames`), it is not estimated.
     """
-    frame = _Frame.of(models, face)
+    is_usual = face.texture.shape[-1] <= TEXTURE_SIDE
+    field = Field(models, face if is_usual else shrunk(face, TEXTURE_SIDE), remove_shade_colour=True)
+    known = field.predict(rig_directions(UNIFORM_LIGHTS))
+    frame = _Frame.of(replace(field, known=known))
     light = _estimated([frame]) if held is None else held
-    small = frame.field.face
+    small = frame.small
     key, ambient = frame.under(light.directions[:1]), frame.ambient.mean(0)
     explained = weighted_sum([key, frame.ambient], light.weights[None])[0]
     skin = small.visible * region_mask("skin", small.texture.shape[-1])
     shading = key[0].mean(0) / ambient.mean(0).clamp_min(_TINY)
     plain = without_baked_in(ambient, small.texture, skin, shading, key_light_fraction(light))
     quotient = Quotient.of(small.texture, explained, small.visible, plain)
-    return SourceLight(light, quotient, quotient.corrected(frame.ambient).mean(0))
+    return SourceLight(
+        light, quotient, quotient.corrected(frame.ambient).mean(0), known if is_usual else None
+    )
 
 
 @torch.no_grad()
 def light_of_frames(models: Models, faces: Sequence[FaceTexture]) -> RigLight:
     """Estimate one light from several frames of a shot together, on small textures."""
-    return _estimated([_Frame.of(models, face) for face in faces])
+    return _estimated([_Frame.of(Field(models, face, remove_shade_colour=True)) for face in faces])
 
 
 def over_rig(light: RigLight, rig: Tensor) -> Tensor:
@@ -99,23 +114,28 @@ def key_light_fraction(light: RigLight) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Frame:
-    """The network's field of a small texture, and its OLATs [L, 3, t, t] under the rig for ambient light."""
+    """The network's field of a face, and the small face, with its OLATs [L, 3, t, t] under ambient lights."""
 
     field: Field
+    small: FaceTexture
     ambient: Tensor
 
     @staticmethod
-    def of(models: Models, face: FaceTexture) -> "_Frame":
-        field = Field(models, shrunk(face), remove_shade_colour=True)
-        return _Frame(field, torch.cat(list(field.olats(rig_directions(_AMBIENT_LIGHTS)))))
+    def of(field: Field) -> "_Frame":
+        small, rig = shrunk(field.face), rig_directions(UNIFORM_LIGHTS)
+        return _Frame(field, small, _small_olats(field, rig, small.visible.shape))
 
     def under(self, directions: Tensor) -> Tensor:
         """Return OLATs [l, 3, t, t] under lights [l, 3]."""
-        return torch.cat(list(self.field.olats(directions)))
+        return _small_olats(self.field, directions, self.small.visible.shape)
 
     def well_observed_texels(self, images: Tensor) -> Tensor:
         """Return the texels [..., N] of images [..., t, t] that are clearly visible in the photo."""
-        return images[..., self.field.face.visible > SEEN_WELL]
+        return images[..., self.small.visible > SEEN_WELL]
+
+
+def _small_olats(field: Field, directions: Tensor, size: tuple[int, ...]) -> Tensor:
+    return torch.cat([F.interpolate(olats, size, mode="area") for olats in field.olats(directions)])
 
 
 def _estimated(frames: Sequence[_Frame]) -> RigLight:
@@ -124,7 +144,7 @@ def _estimated(frames: Sequence[_Frame]) -> RigLight:
         [one.well_observed_texels(torch.cat([one.under(key), one.ambient])) for one in frames], -1
     )
     weights = estimate_key_light(olats, _photo(frames))
-    return RigLight(torch.cat([key, rig_directions(_AMBIENT_LIGHTS)]), weights)
+    return RigLight(torch.cat([key, rig_directions(UNIFORM_LIGHTS)]), weights)
 
 
 def _key_direction(frames: Sequence[_Frame]) -> Tensor:
@@ -139,8 +159,8 @@ def _key_direction(frames: Sequence[_Frame]) -> Tensor:
         return [key_light_error(key, ambient, photo) for key in texels]
 
     if not len(photo):  # too little is visible
-        return rig_directions(_AMBIENT_LIGHTS)[:1]
-    directions, each = rig_directions(_AMBIENT_LIGHTS), errors([one.ambient for one in frames])
+        return rig_directions(UNIFORM_LIGHTS)[:1]
+    directions, each = rig_directions(UNIFORM_LIGHTS), errors([one.ambient for one in frames])
     for ring_deg in _RINGS_DEG:
         best = directions[each.index(min(each))]
         ring = _ring(best, ring_deg)
@@ -150,7 +170,7 @@ def _key_direction(frames: Sequence[_Frame]) -> Tensor:
 
 
 def _photo(frames: Sequence[_Frame]) -> Tensor:
-    return torch.cat([one.well_observed_texels(one.field.face.texture) for one in frames], -1)
+    return torch.cat([one.well_observed_texels(one.small.texture) for one in frames], -1)
 
 
 def _ring(axis: Tensor, degrees: float) -> Tensor:

@@ -7,7 +7,7 @@ reproduces the photo.
 """
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -19,7 +19,7 @@ from torch import Tensor
 from facerf_cli.face.head import Head
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import grid_uv
-from facerf_cli.light.light import Light, PointLights
+from facerf_cli.light.light import UNIFORM_LIGHTS, Light, PointLights, uniform_part
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.network.inputs import MEAN_RADIANCE, is_grey
 from facerf_cli.network.portrait import HAIRY, PortraitInputs, PortraitMaps, PortraitNetwork
@@ -39,7 +39,6 @@ from facerf_cli.run.threads import in_threads
 
 _SUMMARY_LIGHTS = 48  # lights of the rig whose shadows the network sees
 _LIGHTS_AT_ONCE = 16
-_UNIFORM_LIGHTS = 16  # lights that approximate uniform light
 _PORTRAIT_WEIGHT = 0.4  # weight of the portrait field in the face, where the face field is finer
 _SKIN = class_index("skin")
 _APART = 0.01  # blur of everything but skin, as a fraction of the square: skin near it keeps make-up and hair
@@ -93,6 +92,33 @@ class SmoothedFrame:
     balance: WhiteBalance | None = None  # of the whole shot
 
 
+class _Sums(NamedTuple):
+    """Sums of single lights for a `PersonShading`: [M, 3, S, S], `rear` [M, 6, S, S]."""
+
+    shading: Tensor
+    specular: Tensor
+    arriving: Tensor
+    unshadowed: Tensor
+    rear: Tensor
+    gradient: Tensor | None  # [M, 9, S, S]
+
+    def plus(self, one: "_Sums", rgb: Tensor) -> "_Sums":
+        """Add another sum, M = 1, times rgb [M, 3]."""
+        factors = (*[rgb] * 4, rgb.repeat(1, 2))
+        shading, specular, arriving, unshadowed, rear = (
+            a + factor[..., None, None] * b for a, b, factor in zip(self[:5], one[:5], factors, strict=True)
+        )
+        gradient = self.gradient
+        if gradient is not None and one.gradient is not None:
+            gradient = gradient + rgb.repeat_interleave(3, 1)[..., None, None] * one.gradient
+        return _Sums(shading, specular, arriving, unshadowed, rear, gradient)
+
+    @property
+    def shaded(self) -> PersonShading:
+        visibility = self.arriving / self.unshadowed.clamp_min(1e-6)
+        return PersonShading(self.shading, self.specular, visibility, self.rear, self.gradient)
+
+
 class _LightBatch(NamedTuple):
     """Maps of one batch of single lights."""
 
@@ -113,14 +139,20 @@ class PortraitView:
     maps: PortraitMaps  # batch of 1; the albedo is in the units of the network's input
     exposure: Tensor  # radiance of the photo over the maps' radiance in the photo's light, [3, 1, 1]
     correction: Correction | None = None  # ratio image
+    uniform: _Sums | None = None  # of uniform light of rgb 1, M = 1
     original: PersonShading | None = None  # shading in the photo's light, if the user supplied normals
 
     @staticmethod
-    def of(person: SeenPerson, maps: PortraitMaps, source: SourceLight | None) -> "PortraitView":
+    def of(
+        person: SeenPerson,
+        maps: PortraitMaps,
+        source: SourceLight | None,
+        balance: WhiteBalance | None = None,
+    ) -> "PortraitView":
         view = PortraitView(person, maps, torch.full((3, 1, 1), person.exposure))._with_detail()
         if source is None:
-            return view
-        view = view._fit_to_photo(source)
+            return view.with_white_balance(balance)
+        view = view._fit_to_photo(source, balance)
         if person.normals is None:
             return view
         return replace(view, original=view.shade(source.light.directions, source.light.weights[None])[0])
@@ -151,11 +183,14 @@ class PortraitView:
         grey, colour = (one - other for one, other in zip(photo, kept, strict=True))
         return self._with_albedo(lost_detail(grey, colour, weight, _DETAIL_PX, hair))
 
-    def _fit_to_photo(self, source: SourceLight) -> "PortraitView":
-        """Rescale to the photo's exposure and correct, so that the original light reproduces the photo."""
-        used = source.light.weights.sum(1) > 0
-        directions, weights = source.light.directions[used], source.light.weights[used]
-        shading, specular, _ = self._single_lights(directions, self.person.shadows.along(directions))
+    def _fit_to_photo(self, source: SourceLight, balance: WhiteBalance | None) -> "PortraitView":
+        """Rescale to the photo's exposure and correct, so that the original light reproduces the photo.
+
+        Then apply the white balance. The photo's ambient lights are those of uniform light, so their maps
+        also give the person in that.
+        """
+        directions, weights = source.light.directions, source.light.weights
+        shading, specular, visibility = self._single_lights(directions, self.person.shadows.along(directions))
         olats = self.maps.albedo * shading[:, None] + specular[:, None]
         skin = self.person.classes[_SKIN]
         explained = torch.einsum("lc,lcij->cij", weights, olats)
@@ -165,13 +200,22 @@ class PortraitView:
         plain = plain._without_baked_in(shading[0], key_light_fraction(source.light))
         olats = plain.maps.albedo * shading[:, None] + specular[:, None]
         correction = Correction.of(self.person.image / exposure, olats, weights, 1 - self.person.classes[0])
-        return replace(plain, correction=correction)
+        share = torch.full((1, len(directions), 3), 4 / UNIFORM_LIGHTS)
+        parts = [slice(first, first + _LIGHTS_AT_ONCE) for first in range(1, len(share[0]), _LIGHTS_AT_ONCE)]
+        ambient = [
+            _far_batch(directions[at], share[:, at], (shading[at], specular[at], visibility[at]))
+            for at in parts
+        ]
+        view = replace(plain, correction=correction)
+        if balance is not None:
+            view = replace(view, uniform=view._sums(1, ambient)).with_white_balance(balance)
+        return replace(view, uniform=view._sums(1, ambient))
 
     def with_white_balance(self, balance: WhiteBalance | None) -> "PortraitView":
         """Return a copy whose albedo is white-balanced."""
         if balance is None:
             return self
-        rig, person = rig_directions(_UNIFORM_LIGHTS), self.person
+        rig, person = rig_directions(UNIFORM_LIGHTS), self.person
         uniform = self.render(self.shade(rig, torch.full((1, len(rig), 3), 1 / len(rig))))[0]
         return self._with_albedo(balance.gains(uniform, person.image, person.classes))
 
@@ -193,9 +237,8 @@ class PortraitView:
                 torch.split(weights[:, used], _LIGHTS_AT_ONCE, 1),
                 strict=True,
             ):
-                maps = self._single_lights(lights, self.person.shadows.along(lights.detach()))
-                unshadowed = torch.ones(len(lights), 1, 1)
-                yield _LightBatch(*maps, unshadowed, part, rear_fraction(lights), lights[..., None, None])
+                visible = self.person.shadows.along(lights.detach())
+                yield _far_batch(lights, part, self._single_lights(lights, visible))
 
     def _near(self, points: PointLights, weights: Tensor) -> Iterator[_LightBatch]:
         toward, irradiance = points.arriving(self.person.maps.positions_m)
@@ -222,13 +265,21 @@ class PortraitView:
 
         `near` are additional near lights, each with its rgb weights [M, 3].
         """
+        rest, rgb = uniform_part(directions, weights)
+        far = (
+            self._far(directions[rest], weights[:, rest]) if self.uniform else self._far(directions, weights)
+        )
+        sums = self._sums(len(weights), itertools.chain(far, *(self._near(*light) for light in near)))
+        return (sums.plus(self.uniform, rgb) if self.uniform else sums).shaded
+
+    def _sums(self, count: int, batches: Iterable[_LightBatch]) -> _Sums:
+        """Add up batches of single lights, corrected, for a number of sums."""
         size = self.person.image.shape
-        shading, specular, arriving, unshadowed = torch.zeros(4, len(weights), *size).unbind(0)
-        batches = (self._far(directions, weights), *(self._near(*light) for light in near))
+        shading, specular, arriving, unshadowed = torch.zeros(4, count, *size).unbind(0)
         albedo = self.maps.albedo[0].mean(0)
-        rear = torch.zeros(len(weights), 6, *size[1:])
-        gradient = None if self.person.normals is None else torch.zeros(len(weights), 9, *size[1:])
-        for batch in itertools.chain(*batches):
+        rear = torch.zeros(count, 6, *size[1:])
+        gradient = None if self.person.normals is None else torch.zeros(count, 9, *size[1:])
+        for batch in batches:
             shades, speculars = (x.expand(3, *x.shape) for x in (batch.shading, batch.specular))
             factor = torch.ones(3, 1, 1, 1)
             if self.correction is not None:
@@ -248,7 +299,7 @@ class PortraitView:
                 rear = rear + torch.cat(both, 1)
             arriving = arriving + torch.einsum("mlc,lij->mcij", batch.weights, batch.irradiance)
             unshadowed = unshadowed + torch.einsum("mlc,lij->mcij", batch.weights, batch.unshadowed)
-        return PersonShading(shading, specular, arriving / unshadowed.clamp_min(1e-6), rear, gradient)
+        return _Sums(shading, specular, arriving, unshadowed, rear, gradient)
 
     def eye_reflections(self, lights: Light, centre_m: Tensor) -> Tensor:
         """Return the radiance [M, N, 3, s, s] that N irises reflect under M sums of lights.
@@ -289,7 +340,7 @@ class PortraitField:
         squares: Sequence[tuple[SeenPerson, PortraitMaps]],
     ) -> "PortraitField":
         """Return the field from maps of each square; all of it uses the face field's white balance."""
-        views = tuple(PortraitView.of(*one, source).with_white_balance(field.balance) for one in squares)
+        views = tuple(PortraitView.of(*one, source, field.balance) for one in squares)
         return PortraitField(views, field, _texels_in_square(model, head, squares[0][0]))
 
     def shade(
@@ -335,6 +386,12 @@ class PortraitField:
         """Return maps [M, C, S, S] of the first view at the texels of the face, [M, C, T, T]."""
         grid = self.texels[None].expand(len(maps), -1, -1, -1)
         return F.grid_sample(maps, grid, padding_mode="border", align_corners=False)
+
+
+def _far_batch(lights: Tensor, weights: Tensor, maps: tuple[Tensor, Tensor, Tensor]) -> _LightBatch:
+    """Return a batch of far lights [l, 3], weights [M, l, 3], from their `_single_lights`."""
+    unshadowed = torch.ones(len(lights), 1, 1)
+    return _LightBatch(*maps, unshadowed, weights, rear_fraction(lights), lights[..., None, None])
 
 
 def rear_fraction(directions: Tensor) -> Tensor:
