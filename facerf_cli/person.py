@@ -149,8 +149,9 @@ def fit(
         elif face is None:
             (face,) = find_faces(models, pixels, "largest")
         head = head_of(models, pixels, face, geometry, models.sides(texture_side), matte)
+    eyes = face.eyes if face else None
     field = reflectance_of(
-        models, head, reflectance, network_alone, pixels, steady, matte, white_balance, normals
+        models, head, reflectance, network_alone, pixels, steady, matte, white_balance, normals, eyes
     )
     return Person(models, pixels, head, field, matte, reflectance, isinstance(photo, Tensor))
 

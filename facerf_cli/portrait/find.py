@@ -162,6 +162,10 @@ def eyes_of(people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.nda
     mesh = mesh_near(people, image_srgb, Square.around(landmarks_px, _AROUND_68, above=0.1))
     if mesh is None:
         return SeenEyes(np.zeros((0, 3)), np.zeros((0, len(_LIDS[0]), 2)))
+    return _eyes_in(mesh)
+
+
+def _eyes_in(mesh: FaceMesh) -> SeenEyes:
     irises = mesh.points_px[_IRISES, :2]  # [2, 5, 2]: the middle, and four points of the outline
     radii = np.linalg.norm(irises[:, 1:] - irises[:, :1], axis=-1).mean(1)
     return SeenEyes(np.concatenate([irises[:, 0], radii[:, None]], 1), mesh.points_px[_LIDS, :2])
@@ -285,14 +289,16 @@ class NoFaceError(InputError):
 class Face:
     """Face in a photo: its box and its landmarks [68, 2] in the photo's pixels.
 
-    `view` is the Parsing Network's view of it, with further landmarks and their errors, or None. `others` are
-    the photo's other heads; None if they were not detected. `number` is its index from the left.
+    `view` is the Parsing Network's view of it, with further landmarks and their errors, or None. `eyes` are
+    those of its mesh, if any. `others` are the photo's other heads; None if they were not detected. `number`
+    is its index from the left.
     """
 
     box_px: Box
     score: float
     landmarks_px: np.ndarray = field(repr=False)
     view: SquareView | None = field(default=None, kw_only=True, repr=False)
+    eyes: SeenEyes | None = field(default=None, kw_only=True, repr=False)
     others: Sequence[OtherHead] | None = field(default=None, kw_only=True, repr=False)
     number: int = field(default=0, kw_only=True)
 
@@ -423,7 +429,8 @@ def _looked_at(
         error_px=np.concatenate([np.maximum(view.error_px[:68], apart_px / 2), view.error_px[68:]]),
         unsteadiness=unsteadiness(people.face_mesh, image, mesh) if mesh else 0.0,
     )
-    return Face(box_of(from_landmarks(landmarks_px, 1)), math.inf, landmarks_px, view=view), view
+    eyes = _eyes_in(mesh) if mesh else None
+    return Face(box_of(from_landmarks(landmarks_px, 1)), math.inf, landmarks_px, view=view, eyes=eyes), view
 
 
 def _around(face: np.ndarray) -> Square:

@@ -184,6 +184,7 @@ def look_at_person(
     segmentation: Segmentation | None = None,
     matte: np.ndarray | None = None,
     others: Sequence[OtherHead] | None = None,
+    eyes: SeenEyes | None = None,
 ) -> SeenPerson:
     """Segment a person in a photo and fit the proxy of the face, in the square around the landmarks.
 
@@ -195,6 +196,7 @@ def look_at_person(
         segmentation: The person's segmentation; None computes it.
         matte: The person's matte [H, W] from the user.
         others: The photo's other heads; None detects them.
+        eyes: The person's eyes; None detects them.
 
     Raises:
         InputError: No skin is visible, so the exposure is unknown.
@@ -208,7 +210,7 @@ def look_at_person(
         raise InputError("no skin is visible around the landmarks; check them, or use --reflectance field")
     proxy = proxy_of(model, fit, classes, square)
     maps = proxy_maps(proxy, square_camera(fit, square))
-    eyes = eyes_of(people, display, landmarks_px)
+    eyes = eyes or eyes_of(people, display, landmarks_px)
     return SeenPerson(square, _image_in(photo, square), classes, proxy, maps, fit, segmentation, eyes)
 
 

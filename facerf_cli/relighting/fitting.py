@@ -16,7 +16,7 @@ from facerf_cli.face.head import Head, unwrap_face
 from facerf_cli.face.morphable import BUILTIN, MEAN
 from facerf_cli.image.colour import without_fireflies
 from facerf_cli.network.geometry import GeometryEstimate
-from facerf_cli.portrait.find import Face
+from facerf_cli.portrait.find import Face, SeenEyes
 from facerf_cli.portrait.parse import uncovered, uncovered_by
 from facerf_cli.portrait.person import (
     SeenPerson,
@@ -113,11 +113,13 @@ def reflectance_of(
     matte: np.ndarray | None = None,
     white_balance: BalanceMode | None = None,
     normals: np.ndarray | None = None,
+    eyes: SeenEyes | None = None,
 ) -> Reflectance:
     """Predict the reflectance of a head; see `facerf.fit` for the arguments.
 
     The comparison models use neither ratio image nor white balance. The portrait field requires the photo [H,
-    W, 3]; a smoothed frame that does not show the person gets only the face field.
+    W, 3]; a smoothed frame that does not show the person gets only the face field. `eyes` are the person's;
+    None detects them.
     """
     if kind != "field" and kind != "portrait":
         return explain_by_baseline(models, head, kind).reflectance
@@ -139,7 +141,7 @@ def reflectance_of(
     def views_of_person() -> list[SeenPerson]:
         assert photo is not None
         people, others = models.networks.people, head.others
-        person = look_at_person(people, models.face, photo, head.fit, matte=matte, others=others)
+        person = look_at_person(people, models.face, photo, head.fit, None, matte, others, eyes)
         if normals is not None:
             person = with_normals(person, normals)
         wide = wider_square(person.square, person.segmentation.matte)
