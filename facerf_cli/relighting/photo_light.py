@@ -75,9 +75,11 @@ def source_light(models: Models, face: FaceTexture, held: RigLight | None = None
     field = Field(models, face if is_usual else shrunk(face, TEXTURE_SIDE), remove_shade_colour=True)
     known = field.predict(rig_directions(UNIFORM_LIGHTS))
     frame = _Frame.of(replace(field, known=known))
-    light = _estimated([frame]) if held is None else held
-    small = frame.small
-    key, ambient = frame.under(light.directions[:1]), frame.ambient.mean(0)
+    if held is None:
+        light, (key,) = _estimated([frame])
+    else:
+        light, key = held, frame.under(held.directions[:1])
+    small, ambient = frame.small, frame.ambient.mean(0)
     explained = weighted_sum([key, frame.ambient], light.weights[None])[0]
     skin = small.visible * region_mask("skin", small.texture.shape[-1])
     shading = key[0].mean(0) / ambient.mean(0).clamp_min(_TINY)
@@ -91,7 +93,7 @@ def source_light(models: Models, face: FaceTexture, held: RigLight | None = None
 @torch.no_grad()
 def light_of_frames(models: Models, faces: Sequence[FaceTexture]) -> RigLight:
     """Estimate one light from several frames of a shot together, on small textures."""
-    return _estimated([_Frame.of(Field(models, face, remove_shade_colour=True)) for face in faces])
+    return _estimated([_Frame.of(Field(models, face, remove_shade_colour=True)) for face in faces])[0]
 
 
 def over_rig(light: RigLight, rig: Tensor) -> Tensor:
@@ -138,13 +140,14 @@ def _small_olats(field: Field, directions: Tensor, size: tuple[int, ...]) -> Ten
     return torch.cat([F.interpolate(olats, size, mode="area") for olats in field.olats(directions)])
 
 
-def _estimated(frames: Sequence[_Frame]) -> RigLight:
-    key = _key_direction(frames)
-    olats = torch.cat(
-        [one.well_observed_texels(torch.cat([one.under(key), one.ambient])) for one in frames], -1
-    )
+def _estimated(frames: Sequence[_Frame]) -> tuple[RigLight, list[Tensor]]:
+    """Return the light, and each frame [1, 3, t, t] under its key light of rgb 1."""
+    direction = _key_direction(frames)
+    keys = [one.under(direction) for one in frames]
+    each = zip(frames, keys, strict=True)
+    olats = torch.cat([one.well_observed_texels(torch.cat([key, one.ambient])) for one, key in each], -1)
     weights = estimate_key_light(olats, _photo(frames))
-    return RigLight(torch.cat([key, rig_directions(UNIFORM_LIGHTS)]), weights)
+    return RigLight(torch.cat([direction, rig_directions(UNIFORM_LIGHTS)]), weights), keys
 
 
 def _key_direction(frames: Sequence[_Frame]) -> Tensor:
