@@ -243,6 +243,23 @@ def test_a_light_of_the_photo_and_its_layers_are_finite_and_not_negative(
         face_alone.rendered(RenderRequest(relit[0], layers=("albedo",)))
 
 
+def test_uniform_light_that_was_rendered_with_the_photo_is_the_sum_of_its_lights(
+    field: PortraitField,
+) -> None:
+    light = Light.around((1.0, 0.5, 0.25))
+    directions, weights = torch.from_numpy(light.directions), torch.from_numpy(light.weights)[None]
+    apart = weights.repeat(2, 1, 1)  # two sums that are not uniform
+    apart[0, ::2], apart[1, 1::2] = 0, 0
+    view = field.views[0]
+    whole, halves = view.shade(directions, weights), view.shade(directions, apart)
+    for name in ("shading", "specular", "rear"):
+        assert torch.allclose(getattr(whole, name)[0], getattr(halves, name).sum(0), atol=1e-5), name
+    assert field.field.known is not None
+    fresh = replace(field.field, known=None)
+    kept, again = (one.relit(directions, weights) for one in (field.field, fresh))
+    assert torch.allclose(kept, again, atol=1e-5)
+
+
 def test_layers_of_colour_are_cut_by_the_matte_as_those_of_lights_are(
     photo: np.ndarray, person: Person
 ) -> None:
