@@ -246,7 +246,7 @@ def test_a_light_of_the_photo_and_its_layers_are_finite_and_not_negative(
 def test_uniform_light_that_was_rendered_with_the_photo_is_the_sum_of_its_lights(
     field: PortraitField,
 ) -> None:
-    light = Light.around((1.0, 0.5, 0.25))
+    light = Light.uniform((1.0, 0.5, 0.25))
     directions, weights = torch.from_numpy(light.directions), torch.from_numpy(light.weights)[None]
     apart = weights.repeat(2, 1, 1)  # two sums that are not uniform
     apart[0, ::2], apart[1, 1::2] = 0, 0
