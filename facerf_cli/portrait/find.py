@@ -289,8 +289,8 @@ class NoFaceError(InputError):
 class Face:
     """Face in a photo: its box and its landmarks [68, 2] in the photo's pixels.
 
-    `view` is the Parsing Network's view of it, with further landmarks and their errors, or None. `eyes` are
-    those of its mesh, if any. `others` are the photo's other heads; None if they were not detected. `number`
+    `view` is the Parsing Network's view of it, with further landmarks and their errors, or None. `eyes` come
+    from its mesh, if any. `others` are the photo's other heads; None if they were not detected. `number`
     is its index from the left.
     """
 

@@ -36,7 +36,7 @@ SEEN_WELL = 0.9  # visibility above which a small texel shows the photo's colour
 
 @dataclass(frozen=True, eq=False)
 class Predicted:
-    """What the network predicts of a face: its code, and textures [K, 3, T, T] under lights [K, 3]."""
+    """A face as the network predicts it: its code, and textures [K, 3, T, T] under lights [K, 3]."""
 
     encoded: Any
     directions: Tensor

@@ -55,8 +55,8 @@ _TINY = 1e-12  # avoids divisions by 0
 class SourceLight:
     """Estimated light of a photo, key light first, and the field's ratio image under it.
 
-    `uniform` [3, t, t] is the small face under uniform white light. `known` is what the network predicts of
-    the face under each light of that; None if its texture is larger than usual.
+    `uniform` [3, t, t] is the small face under uniform white light. `known` holds the face as the
+    network predicts it under each of its lights; None if its texture is larger than usual.
     """
 
     light: RigLight

@@ -186,8 +186,8 @@ class PortraitView:
     def _fit_to_photo(self, source: SourceLight, balance: WhiteBalance | None) -> "PortraitView":
         """Rescale to the photo's exposure and correct, so that the original light reproduces the photo.
 
-        Then apply the white balance. The photo's ambient lights are those of uniform light, so their maps
-        also give the person in that.
+        Then apply the white balance. The photo's ambient lights also sample uniform light, so their maps
+        give the person in uniform light.
         """
         directions, weights = source.light.directions, source.light.weights
         shading, specular, visibility = self._single_lights(directions, self.person.shadows.along(directions))
