@@ -32,27 +32,27 @@ from facerf_cli.run.stopping import end_again, end_on_signals, leave
 # Panels of the help, one per purpose, and a line for each command, in the order of a user's day.
 _LINES = {
     "Relight photos": {
-        "demo": "Relight a photo that facerf contains.",
-        "relight": "Relight photos by environment maps and single lights.",
+        "demo": "Relight the bundled photo.",
+        "relight": "Relight photos with environment maps and single lights.",
         "view": "Make a web page to relight a photo by dragging lights.",
     },
-    "Take photos apart": {
+    "Analyse photos": {
         "estimate-light": "Estimate the light of a photo.",
         "predict-olat": "Predict a person under each single light (OLAT).",
         "segment": "Cut people out: matte, hair, skin, clothes; landmarks.",
         "fit-geometry": "Fit a 3D face: mesh, texture, normals.",
     },
-    "Make light": {
-        "envmap": "Draw environment maps: skies, rooms, studios, streets.",
+    "Generate light": {
+        "envmap": "Generate environment maps: skies, rooms, studios, streets.",
     },
     "Train and evaluate": {
-        "synth-stage": "Photograph synthetic people in a light stage.",
+        "synth-stage": "Render synthetic people in a light stage.",
         "prepare-dataset": "Prepare a light stage's capture for training.",
         "relight-dataset": "Relight a dataset into training pairs.",
         "train": "Train the networks.",
         "evaluate": "Measure the paper's tables, and other methods.",
     },
-    "Look after facerf": {
+    "Maintenance": {
         "doctor": "Show what is installed, and what is missing.",
         "face-model": "Import other face models.",
     },

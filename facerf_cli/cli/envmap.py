@@ -31,7 +31,7 @@ def envmap(
     maps: DrawnMaps,
     batch: Annotated[BatchOptions, Only("output", "overwrite", "dry_run")],
 ) -> None:
-    """Draw environment maps from a seed: suns, overcast skies, rooms, studios, streets and stages.
+    """Generate environment maps from a seed: suns, overcast skies, rooms, studios, streets and stages.
 
     Maps are lat-long OpenEXR files, scene-linear Rec.709. --size changes the resolution, not the scene. Map
     number n depends only on --seed, n and the kinds, so a larger --count adds maps without changing others.

@@ -109,7 +109,7 @@ class LightSources:
             docs/lights.md. Repeatable.
         light_from: Photo to estimate the light from, as estimate-light does; or background, for the image
             behind the person. NAME=PHOTO joins its light with the named lights. Repeatable.
-        fov_deg: Horizontal angle of view of an image without a face.
+        fov_deg: Horizontal field of view of an image without a face.
         ambient: Ambient fill: a fraction of the sum of the lights (as uniform light), a map, or none.
         rotate: Azimuth to add to the maps; or FROM:TO:N, which renders N frames up to, not including, TO.
         sampling: How maps become weights of lights: cell (integral over the light's cell), smooth (shared

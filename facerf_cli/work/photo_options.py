@@ -64,14 +64,14 @@ class PhotoOptions:
         colourspace: Colour space of the input: sRGB, linear, ACEScg, Rec.2020, 'Display P3', or a name of the
             OCIO configuration.
         layer: Layer of an EXR to read, such as beauty.
-        face_model: Morphable face model to fit: builtin, or a .npz of face-model import.
+        face_model: Morphable face model to fit: builtin, or a .npz written by face-model import.
         face: Face to use if a photo has several: largest, all, or an index from the left, starting at 0.
         landmarks: 68 landmarks (.pts or .json): a file, a folder with one per photo, or a pattern
             (points/{stem}.pts).
         geometry: How the face is fitted: to landmarks, or by the Geometry Network, without landmarks.
         texture_side: Side of the UV texture, a multiple of 256.
         form: Class of a custom Reflectance Network.
-        person: Matte of the person, a grey image or its alpha, instead of the detected one.
+        person: Matte of the person, a greyscale image or an image's alpha, instead of the detected one.
     """
 
     settings: Settings
@@ -161,7 +161,7 @@ class LightOptions(SolveOptions):
         rig: Lights to solve for: the number of a uniform rig, or a file of directions (az,el or x y z; .lp).
         vgg_weights: The paper's V_f for --refine features: imagenet downloads it once (528 MiB); or a file.
         keep_eyes: Also use the eyes, which the paper leaves out.
-        fov_deg: Horizontal angle of view of an image without a face.
+        fov_deg: Horizontal field of view of an image without a face.
         width_px: Width of the map; its height is half of it.
         sh_order: Order of the spherical harmonics in the JSON.
         matte: Grey image, or its alpha, of the part to use, such as skin; --person replaces the detected

@@ -392,7 +392,7 @@ def _write_images(
         ambient = f", with {100 * setup.ambient:g} % ambient fill (--ambient)" if setup.ambient else ""
         if not shared_ev:
             name = setup.name + setup.frame
-            log.info("%s under %s: exposed by %+.2f EV%s", item.input_path, name, ev, ambient)
+            log.info("%s under %s: exposure %+.2f EV%s", item.input_path, name, ev, ambient)
         del relit, each  # frees the maps before the next are made
     return written
 

@@ -116,7 +116,7 @@ def test_one_image_on_standard_output(
     line, _ = said.err.decode().splitlines()  # the other one rates the person
     # no path that is gone
     assert re.fullmatch(
-        rf"{given}/astronaut.png under light_\S+: exposed by \S+ EV, with \S+ % ambient fill .*", line
+        rf"{given}/astronaut.png under light_\S+: exposure \S+ EV, with \S+ % ambient fill .*", line
     )
     with Image.open(io.BytesIO(said.out)) as image:
         assert image.format == "PNG" and image.size == (SIDE, SIDE)
