@@ -39,9 +39,9 @@ def test_the_order_is_that_of_a_day(capsys: Said, monkeypatch: Patch) -> None:
     boxed = (line for line in capsys.readouterr().out.splitlines() if line.startswith(("│", "╭")))
     lines = [line.strip("│╭─╮ ") for line in boxed]
     first = [line.split()[0] for line in lines if line]
-    order = ["Relight", "relight", "Take", "estimate-light", "predict-olat", "segment", "fit-geometry"]
-    order += ["Make", "envmap", "Train", "synth-stage", "prepare-dataset"]
-    order += ["relight-dataset", "train", "evaluate", "Look", "doctor", "face-model"]
+    order = ["Relight", "relight", "Analyse", "estimate-light", "predict-olat", "segment", "fit-geometry"]
+    order += ["Generate", "envmap", "Train", "synth-stage", "prepare-dataset"]
+    order += ["relight-dataset", "train", "evaluate", "Maintenance", "doctor", "face-model"]
     assert [word for word in first if word in order] == order
 
 
@@ -67,7 +67,7 @@ def test_help_and_man_pages_have_panels_and_paragraphs(tmp_path: Path) -> None:
     panels = [line.removeprefix(".SS ") for line in page.splitlines() if line.startswith(".SS ")]
     assert panels == ["Light", "Image", "Face", "Method", "Batch"]
     top = manual.pages()["facerf.1"]
-    assert top.index("fBrelight\\fR") < top.index(".SS Make") < top.index("fBenvmap\\fR")
+    assert top.index("fBrelight\\fR") < top.index(".SS Generate") < top.index("fBenvmap\\fR")
     assert manual._text(".a-b\\c") == "\\&.a\\-b\\ec"
     (tmp_path / "facerf-gone.1").touch()
     manual.main([str(tmp_path)])
