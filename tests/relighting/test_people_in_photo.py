@@ -38,7 +38,7 @@ POINTS = np.arange(136.0).reshape(68, 2)
 class Grey(float):
     """A light, by the grey of a person under it."""
 
-    own = None
+    original_rgb = None
 
 
 def greys(*values: float) -> list[Any]:
@@ -120,13 +120,14 @@ def test_people_that_do_not_fit_together_are_refused_and_faces_are_fitted_one_by
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     faces = [PhotoFace(f"_face{k}", "a.png", Face((k, 0, k + 1, 1), 1.0, POINTS)) for k in range(3)]
-    fitted: list[str] = []
+    fitted: list[float] = []
     monkeypatch.setattr(photos, "find_people", lambda *_: list(faces))
-    monkeypatch.setattr(photos, "_fitted", lambda face, *_: fitted.append(face.tag) or face)
+    monkeypatch.setattr(photos, "head_of", lambda _models, _pixels, face, *_: fitted.append(face.box_px[0]))
+    monkeypatch.setattr(photos, "fitted_face", lambda face, *_: face)
     item, image = Item(Path("a.png"), Path("a"), "a"), LinearImage(np.zeros((4, 6, 3), np.float32))
     options = PhotoOptions(Settings(), face="all")
     each = photos.fit_each(item, image, options)
-    assert next(each).tag == "_face2" and fitted == ["_face2"]
+    assert next(each).tag == "_face2" and fitted == [2]
     memory.set_limit(100 << 20)
     refused(InputError, "3 people in one image: needs ... --composite face", require_people, 3, (4, 6))
 
