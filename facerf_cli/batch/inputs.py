@@ -253,7 +253,7 @@ def only_item(items: Sequence[Item], output: Path, several: bool) -> Item:
     """Return the item whose only output is the file that `-o` names; UsageError for several outputs."""
     item = items[0]
     if several or len(items) > 1 or item.input_path.suffix.lower() in VIDEO_SUFFIXES:
-        raise UsageError(f"-o {output}: names a single file; use one photo, face and light, or a folder")
+        raise UsageError(f"-o {output}: is a single file, but several images would be written; use a folder")
     return replace(item, output_base=output.with_suffix(""), name=output.stem)
 
 

@@ -123,9 +123,8 @@ def relight(
     """Relight people in photos or OLAT stacks under environment maps and single lights.
 
     Each result is a scene-linear EXR, with the person's matte as layer person.A, plus an exposed PNG.
-    -o FILE writes a single image instead; -o - writes one image to standard output. Backgrounds that keep
-    their look (photo, image, colour) are divided by 2^EV in the EXR; with --exposure 0 they keep their own
-    values.
+    -o FILE writes a single image instead; -o - writes one image to standard output. In the EXR, a
+    background that keeps its look (photo, image, colour) is divided by 2^EV, the exposure of the PNG.
 
     A video, or an image sequence with --sequence, is split at cuts. Each shot has one identity and one light
     estimate; pose, expression and matte are smoothed across neighbouring frames. -o FILE.mp4 or FILE.mov

@@ -36,11 +36,11 @@ class Segment(PhotoWork):
 def segment(inputs: FramesArgument, work: Segment, shots: ShotOptions, batch: FileOrFolder) -> None:
     """Cut people out of photos: matte, hair, skin, garment and other classes, and landmarks.
 
-    Each photo gets _segment.exr (RGBA: the person without background colour, premultiplied; layers 'person.A'
-    and 'class.skin', 'class.hair', 'class.ears', 'class.neck', 'class.garment' and others, 0 to 1, which sum
-    to the matte), _person.png (a transparent cut-out), _overlay.jpg (classes and landmarks over the photo) and
-    _landmarks.json (for --landmarks). The report contains each photo's confidence. -o cut.png or cut.exr
-    writes only the cut-out or the layers of one photo.
+    Each photo gets _segment.exr (RGBA: the person without background colour, premultiplied; layers 0 to 1:
+    'person.A', the matte, and its parts 'class.skin', 'class.hair', 'class.ears', 'class.neck',
+    'class.garment' and others), _person.png (a transparent cut-out), _overlay.jpg (classes and landmarks over
+    the photo) and _landmarks.json (for --landmarks). The report contains each photo's confidence. -o cut.png
+    or cut.exr writes only the cut-out or the layers of one photo.
 
     Frames of a video, or of an image sequence with --sequence, are smoothed with the frames around them.
     """

@@ -331,7 +331,9 @@ def _entry(text: str) -> tuple[list[LitImage], str | None]:
         fields = settings if place is None or is_rig else {"from": place, **settings}
         lights.append(light_by_keys(fields, "--light", name, _rig(place) if place and is_rig else None))
     if len({bool(light.names) for light in lights}) > 1:
-        raise UsageError(f"{where} only some lights have names; name all of them (key=40,20) or none")
+        raise UsageError(
+            f"{where} only some lights have names, as original and rigs do; name all: rim=145,15"
+        )
     if any(name is not None for name, _ in places):
         return lights, None
     if settings:

@@ -186,8 +186,8 @@ def collect_setups(
     apart = dict.fromkeys([setup.name for setup in setups] + [image.name for image in images[:-1]])
     if apart and images and images[-1].is_shared:
         log.warning(
-            "%s: not in the image of the named lights (%s); to combine a light with them, name it: "
-            "fill=40,20, fill=rembrandt or --envmap sky=MAP",
+            "%s: rendered separately from %s; to combine a light with it, name the light: fill=40,20, "
+            "fill=rembrandt or --envmap sky=MAP",
             ", ".join(apart),
             images[-1].name,
         )

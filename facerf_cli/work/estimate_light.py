@@ -188,8 +188,8 @@ def _write_guess(item: Item, image: LinearImage, options: LightOptions) -> dict[
     fov_deg = options.fov_deg or stated_fov_deg(image) or FOV_DEG
     guess = light_of_picture(torch.from_numpy(image.pixels), fov_deg)
     log.warning(
-        "%s: no usable face, so the light is a guess from the image, %.0f degrees wide (--fov); expected error "
-        "of a matte white ball's shading: %.0f %% (RMS)",
+        "%s: no usable face, so the light is a guess from the image, %.0f degrees wide (--fov); expected "
+        "error of a matte white ball's shading: %.0f %% (RMS)",
         item.input_path,
         fov_deg,
         100 * guess.error,

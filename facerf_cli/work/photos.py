@@ -72,8 +72,9 @@ class PhotoFace:
         if not self.facts:
             return {}
         confidence = confidence_of(self.facts)
-        why = ", ".join(SCALES[name].said or name for name in confidence.reasons)
         if not quiet:
+            reasons = () if confidence.word == "sure" else confidence.reasons
+            why = ", ".join(SCALES[name].said or name for name in reasons)
             log.info("%s: detection is %s%s", self.name, confidence.word, f" ({why})" if why else "")
         factors = {name: round(factor, 3) for name, factor in confidence.factors.items()}
         return {"confidence": round(confidence.score, 3), "certainty": confidence.word, "factors": factors}

@@ -185,7 +185,7 @@ class RelightOptions(FieldOptions, PortraitOptions):
     exposure: Exposure | None = option(
         None,
         metavar="auto|face|EV",
-        shown_default="auto; 0 with original or delight",
+        shown_default="auto; 0 with original, delight or --light-from background",
         parse=parse_exposure,
         panel=IMAGE,
         everyday=True,

@@ -104,7 +104,7 @@ WRONG: dict[str, dict[str, str]] = {
         "--format png --aov normal": "--aov ... add exr to --format",
         "-o me.gif": "-o me.gif: ... use a folder",
         "-o who.csv/out": "cannot be written to",
-        "-o two.png --light 9,9": "-o two.png: ... use one photo, face and light",
+        "-o two.png --light 9,9": "-o two.png: ... use a folder",
         "-o wrong.png --format exr": "-o wrong.png: ",
         "-o a.jpg": "-o a.jpg: is ",
     },
@@ -128,8 +128,8 @@ WRONG: dict[str, dict[str, str]] = {
     "segment a.jpg": {
         "-o me.jpg": "-o me.jpg: ... the suffix .png or .exr",
         "-o me.JSON": "-o me.JSON: ... use a folder",
-        "-o me.png --face all": "-o me.png: ... use one photo, face and light",
-        "-o me.png b.jpg": "-o me.png: ... use one photo, face and light",
+        "-o me.png --face all": "-o me.png: ... use a folder",
+        "-o me.png b.jpg": "-o me.png: ... use a folder",
         "-o me.png --name {stem}": "--name: ... remove it",
         "-o a.JPG": "-o a.JPG: ... use a folder",
         "--person none.png": "no such file or folder",
@@ -139,7 +139,7 @@ WRONG: dict[str, dict[str, str]] = {
         "--landmarks none": "no such file or folder",
     },
     "view": {
-        "a.jpg b.jpg -o me.html": "-o me.html: ... use one photo, face and light",
+        "a.jpg b.jpg -o me.html": "-o me.html: ... use a folder",
         "index": "rename the photo",
     },
     "envmap": {"--kind moon": "moon", "--size 33": "--size", "--count 0": "--count"},
