@@ -258,22 +258,26 @@ def compare_images(
             faces = find_faces(bench.models.networks.people, truth.pixels, str(files.truth))
             landmarks_px = faces[0].landmarks_px
         source = None if files.source is None else read_pixels(files.source).pixels
-        predictions = rendered(files.case, source, bench) if options.renders else {}
+        side_px = truth.pixels.shape[1]
+        predictions = rendered(files.case, source, bench, side_px) if options.renders else {}
         predictions |= {name: read_pixels(path).pixels for name, path in files.predictions.items()}
         yield Comparison(files.case, truth.pixels, mask, predictions, source, landmarks_px)
 
 
 @torch.no_grad()
-def rendered(case: Case, source: np.ndarray | None, bench: Bench) -> dict[str, np.ndarray]:
+def rendered(
+    case: Case, source: np.ndarray | None, bench: Bench, side_px: int
+) -> dict[str, np.ndarray]:
     """Render a case with each of facerf's methods from its source [S, S, 3].
 
-    In the source's pose, return the image of `facerf relight`; in another pose, only the face.
+    In the source's pose, return the image of `facerf relight`; in another pose, only the face, in the
+    target's frame, whose side is `side_px`.
     """
     if source is None or not {*_LIGHT, *_POSE, *_POSITION, "pose"} <= case.facts.keys():
         raise InputError(f"{case.name}: has no source, pose and light; use the output of evaluate cases")
     azimuth_deg, elevation_deg, *turn_deg = (float(case.facts[name]) for name in _LIGHT + _POSE)
     lights = Light.each(azel_to_direction(azimuth_deg, elevation_deg)[None])
-    frame = Crop(0.0, 0.0, float(source.shape[1]), source.shape[1])
+    frame = Crop(0.0, 0.0, float(side_px), side_px)
     face = bench.find(source, case.name)
     images = {}
     for method, head in bench.heads(source, face):

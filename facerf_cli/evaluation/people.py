@@ -74,9 +74,13 @@ class Method:
     def images(
         self, photo: np.ndarray | None, head: Head, lights: Light, target: Target
     ) -> Iterator[np.ndarray]:
-        """Yield an image under each weighted sum of lights, inside the photo if there is one."""
+        """Yield an image under each weighted sum of lights, inside the photo if there is one.
+
+        In the pose of the target's fit, yield only the face, in the fit's crop.
+        """
         reflectance = reflectance_of(self.models, head, self.kind, self.network_alone, photo=photo)
-        composition = Person(self.models, photo, head, reflectance).prepare(target)
+        framed_by = photo if target.fit is None else None
+        composition = Person(self.models, framed_by, head, reflectance).prepare(target)
         for relit in composition.relit(lights):
             yield composition.image(relit)
 

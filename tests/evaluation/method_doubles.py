@@ -77,7 +77,8 @@ class Double(Method):
     ) -> Iterator[np.ndarray]:
         for row in lights.weights:
             light = RigLight(lights.directions, row)
-            yield Person(self.models, photo, head, self.reflectance(head)).image(light, target)
+            framed_by = photo if target.fit is None else None
+            yield Person(self.models, framed_by, head, self.reflectance(head)).image(light, target)
 
     def reflectance(self, head: Head) -> Any:
         return Unlit(head.face, self.gain)
