@@ -50,8 +50,8 @@ _CLASSES: dict[tuple[str, str], type[Any]] = {
 }
 
 
-def installed_class(name: str, option: str) -> type[Any]:
-    """Import the class package.module:Class, never from the working directory.
+def installed_class(name: str, option: str, base: type[Any]) -> type[Any]:
+    """Import the subclass package.module:Class of `base`, never from the working directory.
 
     Raises UsageError, which names the option, if no installed package contains it.
     """
@@ -59,23 +59,31 @@ def installed_class(name: str, option: str) -> type[Any]:
     sys.path[:] = [folder for folder in path if Path(folder).resolve() != Path.cwd()]
     try:
         kind = pkgutil.resolve_name(name)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise UsageError(f"{option} {name}: {error}; install its package") from None
+    except ImportError as error:
+        advice = "install its package (the working directory is not searched)"
+        raise UsageError(f"{option} {name}: {error}; {advice}") from None
+    except (AttributeError, ValueError) as error:
+        raise UsageError(f"{option} {name}: {error}; correct the name") from None
     finally:
         sys.path[:] = path
-    if not isinstance(kind, type):
-        raise UsageError(f"{option} {name}: is not a class; use package.module:Class")
+    if not (isinstance(kind, type) and issubclass(kind, base)):
+        needed = f"{base.__module__}:{base.__name__}"
+        raise UsageError(f"{option} {name}: not a subclass of {needed}; use one")
     return kind
 
 
-def use_form(form: str | None) -> None:
+def use_form(form: str) -> None:
     """Accept checkpoints with Reflectance Networks of the user's installed class package.module:Class.
 
     Names of facerf's own forms have no effect. Raises UsageError if the class does not exist.
     """
-    if form and ":" in form:
-        _CLASSES["reflectance", form] = kind = installed_class(form, "--form")
-        kind.form = form
+    if form in REFLECTANCE_FORMS:
+        return
+    if ":" not in form:
+        forms = ", ".join(REFLECTANCE_FORMS)
+        raise UsageError(f"--form {form}: no such form; use one of package.module:Class, {forms}")
+    _CLASSES["reflectance", form] = kind = installed_class(form, "--form", ReflectanceNetwork)
+    kind.form = form
 
 
 def form_of(name: str, form: str) -> str:

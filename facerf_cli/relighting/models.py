@@ -153,7 +153,7 @@ def load_models(
     checkpoint: str | Path | Sequence[str | Path] | None = None,
     face_model: str | Path = BUILTIN,
     device: str | torch.device = "cpu",
-    form: str | None = None,
+    form: str | Sequence[str] | None = None,
 ) -> Models:
     """Load a face model and networks. A network is read from its file when it is first used.
 
@@ -162,7 +162,7 @@ def load_models(
             networks that its last training trained; all others are the shipped ones.
         face_model: "builtin", or the file of an imported face model.
         device: "cpu", "cuda", "cuda:1", "mps" or a `torch.device`.
-        form: package.module:Class, the installed class of a custom Reflectance Network.
+        form: "package.module:Class", the name of an installed custom Reflectance Network, or a list.
 
     Raises:
         InputError: A file is not a checkpoint.
@@ -173,7 +173,8 @@ def load_models(
             device = torch.empty(0, device=device).device
         except (RuntimeError, AssertionError):
             raise UsageError(f"device {device}: not found by torch; use cpu, cuda or mps") from None
-    use_form(form)
+    for name in [form] if isinstance(form, str) else form or ():
+        use_form(name)
     checkpoints = [checkpoint] if isinstance(checkpoint, (str, Path)) else checkpoint or ()
     files = serving_files([checkpoint_file(Path(path)) for path in checkpoints], user="facerf")
     path = files["reflectance"]

@@ -198,7 +198,11 @@ class Trainer:
         for number, part in enumerate(batch.parts(parts), 1):
             waits = isinstance(model, DistributedDataParallel) and number < parts
             with model.no_sync() if waits else nullcontext():  # type: ignore[operator]
-                terms = {name: term / parts for name, term in model(part.to(self.device)).items()}
+                terms = model(part.to(self.device))
+                if not (isinstance(terms, dict) and terms and all(map(_is_number, terms.values()))):
+                    advice = "return a dict of tensors without dimensions"
+                    raise UsageError(f"{type(self.objective).__name__}.forward: no terms of a loss; {advice}")
+                terms = {name: term / parts for name, term in terms.items()}
                 torch.stack(list(terms.values())).sum().backward()  # type: ignore[no-untyped-call]
             totals = {name: totals.get(name, 0) + term.detach() for name, term in terms.items()}
         return totals
@@ -333,6 +337,10 @@ class Trainer:
             ) from None
         networks, _ = load_networks(self.last, LAYOUT_VERSION)
         self.carried = {name: networks[name] for name in networks.keys() - self.networks.keys()}
+
+
+def _is_number(term: Any) -> bool:
+    return isinstance(term, Tensor) and term.ndim == 0
 
 
 def build_optimizer(settings: AdamW | Adadelta, parameters: Iterable[nn.Parameter]) -> torch.optim.Optimizer:

@@ -154,7 +154,7 @@ class TextureObjective(SamplesObjective):
         """Compute the term `root` and, with S_f, `light_features`, means over faces."""
         network, sample = self.network, self.textures(batch.sample)
         with self.mixed_precision():
-            encoded = self._encoded(sample)
+            encoded = self.encoded(sample)
             root = network.decode_root(encoded, sample.normals_target, sample.lights).float()
         # the network divides by the exposure that it measures on visible texels
         target = sample.target / encoded.exposure[:, None]
@@ -170,14 +170,15 @@ class TextureObjective(SamplesObjective):
     def measure_sample(self, batch: Sample | SampleCrops) -> tuple[Sample, dict[str, Tensor], np.ndarray]:
         """Measure the Si-MSE, clipped at white; draw source and true, visible source and predicted OLATs."""
         sample = self.textures(batch)
-        predicted = self.network.decode(self._encoded(sample), sample.normals_target, sample.lights)
+        predicted = self.network.decode(self.encoded(sample), sample.normals_target, sample.lights)
         error = clipped_si_mse(predicted, sample.target, sample.weight).mean()
         mask = (sample.weight[0] > 0).float()
         truth = [sample.source[0], *(sample.target[0] * mask)]
         rows = [truth, [sample.source[0] * sample.visible[0], *(predicted[0] * mask)]]
         return sample, {"si_mse": error}, tiled(rows)
 
-    def _encoded(self, sample: Sample) -> Any:
+    def encoded(self, sample: Sample) -> Any:
+        """Encode the sources of textures, without their colour cast, for the network's `decode`."""
         source = without_cast(sample.source, sample.visible, self.source_colours)
         return self.network.encode(source, sample.normals_source, sample.visible)
 

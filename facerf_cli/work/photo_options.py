@@ -70,7 +70,7 @@ class PhotoOptions:
             (points/{stem}.pts).
         geometry: How the face is fitted: to landmarks, or by the Geometry Network, without landmarks.
         texture_side: Side of the UV texture, a multiple of 256.
-        form: Class of a custom Reflectance Network.
+        form: Class of a custom Reflectance Network. Repeatable.
         person: Matte of the person, a greyscale image or an image's alpha, instead of the detected one.
     """
 
@@ -90,7 +90,7 @@ class PhotoOptions:
         shown_default="the checkpoint's; 256 for the shipped one",
         panel=METHOD,
     )
-    form: str | None = option(None, metavar="MODULE:CLASS", shown_default=False, panel=METHOD)
+    form: tuple[str, ...] = option((), metavar="MODULE:CLASS", shown_default=False, panel=METHOD)
     person: Path | None = option(None, metavar=COMPANION, shown_default=False, panel=FACE)
     ocio_config: str = ""  # defines the colour space; '' is $OCIO, or the built-in one
 

@@ -9,7 +9,6 @@ from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.network import checkpoint
 from facerf_cli.network.checkpoint import (
     form_of,
-    installed_class,
     load_networks,
     new_network,
     save_networks,
@@ -47,13 +46,20 @@ def test_a_class_that_extends_a_form_is_made_like_it(package: Path) -> None:
 def test_what_is_not_installed_is_one_line(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         patch.chdir(package)  # nothing comes from the working directory
-        refused(UsageError, "install its package", installed_class, "my_lab.networks:Darker", "--form")
-    for name in ("my_lab.networks:Nobody", "nobody.networks:Darker", "my_lab.networks:number"):
-        refused(UsageError, f"--objective {name}: ", installed_class, name, "--objective")
+        refused(UsageError, "install its package ... working directory", use_form, NAME)
+    for name, advice in (
+        ("my_lab.networks:Nobody", "correct the name"),
+        ("nobody.networks:Darker", "install its package"),
+        ("my_lab.networks:number", "not a subclass of"),
+        ("my_lab.networks:Doubled", "not a subclass of"),
+    ):
+        refused(UsageError, f"--form {name}: ... {advice}", use_form, name)
+    for name in ("my_lab.networks.Darker", "Darker"):
+        refused(UsageError, f"--form {name}: ... package.module:Class", use_form, name)
+    assert checkpoint._CLASSES == FORMS
 
 
 def test_facerfs_own_forms_import_nothing() -> None:
     use_form("paper")
-    use_form(None)
     assert checkpoint._CLASSES == FORMS
     refused(UsageError, "no such Reflectance Network", new_network, "reflectance", "os:system", {})

@@ -348,6 +348,13 @@ def test_the_papers_preset_is_the_papers(tmp_path: Path) -> None:
         assert torch.equal(tensor, state_of(tmp_path)["networks"][f"reflectance.{name}"])
 
 
+@pytest.mark.parametrize("terms", [torch.zeros(()), {}, {"loss": torch.zeros(2)}, {"loss": 1.0}])
+def test_a_forward_without_terms_of_a_loss_is_refused(tmp_path: Path, terms: Any) -> None:
+    objective = toy_objective()
+    objective.forward = lambda batch: terms  # type: ignore[method-assign]
+    refused(UsageError, "TextureObjective.forward: no terms of a loss", train, objective, tmp_path, TINY)
+
+
 def test_mixed_precision_reaches_the_objective(tmp_path: Path) -> None:
     objective = toy_objective()
     train(objective, tmp_path, replace(TINY, bf16=True, steps=2))
