@@ -33,12 +33,15 @@ _LEAST_LIGHTS = 3  # fewer determine no normals
 _LISTED = 3  # names of a note
 _DIGITS = 6
 _LIST_NAME = re.compile(r".*\.lp|light.*\.(txt|json)", re.IGNORECASE)
-_TO_FILL_IN = (
-    "fill in each null: colour_space ('linear' for values in proportion to light with Rec.709 primaries, "
-    "'sRGB' for images with a display curve), direction (unit vector in world space, toward the light), "
-    "world_to_camera (3 x 4 in metres, OpenCV axes), K, width and height (in pixels); remove lights that are "
-    "several lights, or none"
-)
+_TO_FILL_IN = {
+    "colour_space": "'linear' for values in proportion to light with Rec.709 primaries, 'sRGB' for images "
+    "with a display curve",
+    "direction": "unit vector in world space, toward the light",
+    "world_to_camera": "3 x 4 in metres, OpenCV axes",
+    "K": "3 x 3 in pixels",
+    "width": "pixels",
+    "height": "pixels",
+}
 
 Key = tuple[str, str, str]  # subject, camera and light; empty if the pattern does not name them
 
@@ -99,14 +102,14 @@ def draft_stage(folder: Path, pattern: str) -> dict[str, Any]:
     inventory = ", ".join(counted(count, field) for count, field in zip(counts, FIELDS, strict=True))
     expected, missing = math.prod(counts), math.prod(counts) - len(frames.paths)
     exist = f"{missing} of {expected} frames are missing" if missing else f"all {expected} frames exist"
-    notes = [f"{pattern}: {inventory}; {exist}", _TO_FILL_IN]
+    notes = [f"{pattern}: {inventory}; {exist}"]
     directions = _read_directions(folder, frames, notes)
     notes.append("check: lights: the intensity 1 1 1 is assumed of each; black_level: 0 is assumed")
     if odd := frames.odd:
         fault = "have ids with other characters than letters, digits, - and _"
         notes.append(f"left out: {counted(len(odd), 'image')} that {fault} ({_list(odd)})")
     name = folder.resolve().name
-    return {
+    stage: dict[str, Any] = {
         "format": STAGE_FORMAT,
         "draft": notes,
         "colour_space": None,
@@ -121,6 +124,11 @@ def draft_stage(folder: Path, pattern: str) -> dict[str, Any]:
         "cameras": [_camera(folder, camera, frames, is_alone=len(cameras) == 1) for camera in cameras],
         **({} if "{subject}" in pattern else {"subjects": {name if is_name(name) else _LONE_SUBJECT: {}}}),
     }
+    entries = [stage, *stage["lights"], *stage["cameras"]]
+    nulls = {key for entry in entries for key, value in entry.items() if value is None}
+    to_fill_in = ", ".join(f"{key} ({meaning})" for key, meaning in _TO_FILL_IN.items() if key in nulls)
+    notes.insert(1, f"fill in each null: {to_fill_in}; remove lights that are several lights, or none")
+    return stage
 
 
 def as_text(stage: Mapping[str, Any]) -> str:
@@ -161,7 +169,9 @@ def _read_directions(folder: Path, frames: Frames, notes: list[str]) -> dict[str
         axes = "x right, y up, z toward the camera, as world space"
         notes.append(f"check: lights: directions from {_list([lists[0].name])}, {axes}")
     else:
-        fault = f"its {len(listed)} lines name none of the {len(light_ids)} lights"
+        has_names, given = any(name for name, _ in listed), counted(len(listed), "direction")
+        lights = f"{len(light_ids)} lights"
+        fault = f"names none of the {lights}" if has_names else f"{given} for {lights}"
         notes.append(f"left out: a list of lights: {lists[0]}: {fault}")
     units = {light: np.array(vector) / np.linalg.norm(vector) for light, vector in vectors.items()}
     return {light: (unit.round(_DIGITS) + 0.0).tolist() for light, unit in units.items()}  # no -0.0

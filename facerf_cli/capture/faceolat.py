@@ -6,8 +6,8 @@ Frames are `Cam06/ID20003/ID20003.000001.avif`, or `.exr` before conversion: cam
 three digits of a take are the person's number. `lights/light_pattern_per_frame.json` pairs frames, counted
 from 0, with lights: 0 stands for all lights, used for tracking; other numbers count from 1 in the positions
 of `lights/light_pattern_metadata.json`, in millimetres. `calibration/cameras/*.xml` are written by Metashape.
-Two assumptions are unverified: that they have the same axes and unit (`_UNIT_M`), and that the first file of
-a take is frame 0 (`_frames`).
+Two assumptions are unverified: that they have the same axes and unit (`_UNIT_M`), and that the lowest number
+of all files is frame 0 (`_frames`).
 
 World space is the stage's, in metres, with its origin at the centre of the lights' sphere, where the near
 lights are equal, with unknown intensity. EXR files, and AVIF files converted without colour calibration
@@ -30,7 +30,7 @@ from facerf_cli.files.documents import Document, Three, checked, read_document
 from facerf_cli.files.texts import read_text
 
 _UNIT_M = 1e-3
-_TAKE = re.compile(r"ID\w*?(\d{3})")
+_TAKE, _FRAME = re.compile(r"ID\w*?(\d{3})"), re.compile(r"ID\w+\.(\d+)(\.\w+)")
 _DARK_TAKES, _DARK_PEOPLE, _DARK_STOPS = "ID2", range(88, 117), -1.0  # one stop darker than the others
 _FARTHEST_M = 10.0  # of a camera from the lights' centre, if both have the same axes and unit
 _MOST_FRAMES = 4096
@@ -53,16 +53,18 @@ def read_faceolat(folder: Path, is_linear: bool) -> Capture:
         raise InputError(
             f"{folder}: no calibration/cameras/*.xml; use the folder that contains Cam01, lights, ..."
         )
-    first = next(iter(sorted(folder.glob("Cam*/ID*/ID*.*"))), None)
-    if first is None:
+    images = [_FRAME.fullmatch(path.name) for path in sorted(folder.glob("Cam*/ID*/ID*.*"))]
+    frames = [image.groups() for image in images if image]
+    if not frames:
         raise InputError(f"{folder}: no images such as Cam06/ID20003/ID20003.000001.avif; copy them there")
-    suffix, width = first.suffix, len(first.name.split(".")[1])
+    number, suffix = frames[0]
+    first = min(int(frame) for frame, _ in frames)  # files may be missing in some takes
     is_linear = is_linear or suffix.lower() == ".exr"
     places = np.stack(
         read_document(folder / "lights/light_pattern_metadata.json", _Positions, "copy it").light_positions
     )
     centre = sphere_centre(places)
-    names = _frames(folder, len(places), int(first.name.split(".")[1]), width)
+    names = _frames(folder, len(places), first, len(number))
     numbers = sorted(names)
     pattern = f"{{camera}}/{{subject}}/{{subject}}.{{light}}{suffix}"
     cameras = {}
@@ -108,7 +110,7 @@ def read_faceolat(folder: Path, is_linear: bool) -> Capture:
 
 
 def _frames(folder: Path, lights: int, first: int, width: int) -> dict[int, str]:
-    """Return the names of frames of one light, by light; the first file of a take has the number `first`."""
+    """Return the names of frames of one light, by light; frame 0 has the number `first`."""
     path = folder / "lights/light_pattern_per_frame.json"
     names = {}
     for pair in read_document(path, list[list[int]], "copy it"):

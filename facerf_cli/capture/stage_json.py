@@ -1,7 +1,7 @@
 """Reader for `stage.json`, which describes a capture and lies next to its images.
 
     {"format": "facerf-stage-1", "axes": "opencv", "unit": "m",
-     "colour_space": "lin_rec709", "black_level": 0.0,
+     "colour_space": "linear", "black_level": 0.0,
      "pattern": "{subject}/{camera}/{light}.exr",
      "lights": [{"id": "L000", "direction": [x, y, z] or "position": [x, y, z], "intensity": [r, g, b]}],
      "cameras": [{"id": "C0", "width": 256, "height": 256, "K": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]],

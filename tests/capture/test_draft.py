@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 from itertools import product
 from pathlib import Path
@@ -84,6 +85,8 @@ def test_one_camera_is_the_world(tmp_path: Path, form: str, pattern: str, subjec
     (folder / "scene.lp").write_text("4\nL1.jpg 0.6 0 0.8\nL2.jpg 0 1 0\nL3.jpg -1 0 0\nL10.jpg 0 0 2\n")
     stage = draft_stage(folder, pattern)
     assert stage["cameras"][0]["world_to_camera"] == FACING and noted(stage, "directions from scene.lp")
+    (to_fill_in,) = (note for note in stage["draft"] if note.startswith("fill in"))
+    assert re.findall(r"(\w+) \(", to_fill_in) == ["colour_space", "K"]
     stage["cameras"][0]["K"], stage["colour_space"] = K, "linear"
     (folder / "stage.json").write_text(as_text(stage))
     capture = read_capture(folder)
@@ -115,7 +118,9 @@ def test_a_pattern_may_repeat_the_subject(tmp_path: Path) -> None:
 def test_a_list_that_is_of_other_images_is_said(tmp_path: Path) -> None:
     folder = stage_at(tmp_path)
     (folder / "lights.txt").write_text("K1 0 0 1\n")
-    assert noted(draft_stage(folder, FOLDERS), "name none of the 4 lights")
+    assert noted(draft_stage(folder, FOLDERS), "names none of the 4 lights")
+    (folder / "lights.txt").write_text("0 0 1\n")
+    assert noted(draft_stage(folder, FOLDERS), "1 direction for 4 lights")
     (folder / "lights.txt").write_text("K1 0 0\n")
     stage = draft_stage(folder, FOLDERS)
     assert noted(stage, "line 1") and stage["lights"][0]["direction"] is None

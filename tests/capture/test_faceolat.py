@@ -1,6 +1,8 @@
 """FaceOLAT's layout and Metashape's calibration, by a stage that was rewritten in them."""
 
 import json
+import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +49,15 @@ def test_frames_lights_cameras_and_colours_are_those_of_the_stage(given: Given) 
     for subject, take in takes.items():
         found, true = capture.frame(take, "Cam01", 7), stage.frame(subject, "C1", 7)
         np.testing.assert_allclose(found, true, atol=2e-3)
+
+
+def test_a_missing_first_file_shifts_no_take(given: Given, tmp_path: Path) -> None:
+    whole = read_capture(given[1], ReadSettings("faceolat"))
+    folder = tmp_path / "faceolat"
+    shutil.copytree(given[1], folder, copy_function=os.symlink)
+    (folder / "Cam00/ID10001/ID10001.000001.exr").unlink()
+    (folder / "Cam00/ID10001/ID10001.txt").touch()
+    assert read_capture(folder, ReadSettings("faceolat")).light_ids == whole.light_ids
 
 
 @pytest.mark.slow
