@@ -26,6 +26,9 @@ class Darker(DefaultReflectanceNetwork):
     def decode_root(self, *given):
         return 0.5 * super().decode_root(*given)
 
+class Same(Darker):
+    pass
+
 class Doubled(TextureObjective):
     def forward(self, batch):
         return {name: 2 * term for name, term in super().forward(batch).items()}

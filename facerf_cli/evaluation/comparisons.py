@@ -265,9 +265,7 @@ def compare_images(
 
 
 @torch.no_grad()
-def rendered(
-    case: Case, source: np.ndarray | None, bench: Bench, side_px: int
-) -> dict[str, np.ndarray]:
+def rendered(case: Case, source: np.ndarray | None, bench: Bench, side_px: int) -> dict[str, np.ndarray]:
     """Render a case with each of facerf's methods from its source [S, S, 3].
 
     In the source's pose, return the image of `facerf relight`; in another pose, only the face, in the

@@ -90,7 +90,9 @@ class PhotoOptions:
         shown_default="the checkpoint's; 256 for the shipped one",
         panel=METHOD,
     )
-    form: tuple[str, ...] = option((), metavar="MODULE:CLASS", shown_default=False, panel=METHOD)
+    form: tuple[str, ...] = option(
+        (), metavar="MODULE:CLASS", shown_default=False, typed=list[str] | None, parse=tuple, panel=METHOD
+    )
     person: Path | None = option(None, metavar=COMPANION, shown_default=False, panel=FACE)
     ocio_config: str = ""  # defines the colour space; '' is $OCIO, or the built-in one
 

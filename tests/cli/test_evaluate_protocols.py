@@ -168,15 +168,15 @@ def test_the_papers_numbers_are_measured_as_far_as_there_are_pairs(
 def test_one_table_of_facerf_an_own_network_and_a_folder(
     folder: Path, tmp_path: Path, monkeypatch: Patch, capsys: Said
 ) -> None:
-    """On cases that are frozen without any checkpoint; the own network is a form of an installed package."""
+    """On cases that are frozen without any checkpoint; own networks are forms of an installed package."""
     write_own_package(tmp_path / "site", monkeypatch)
     face = load_fit(read_dataset(folder).fit_path("0001", "C0")).landmarks_px.double().numpy()
     monkeypatch.setattr(people, "find_faces", lambda *_: [face_at(face)])
     monkeypatch.setattr(comparisons, "find_faces", lambda *_: [face_at(face)])
     frozen, theirs, out = (tmp_path / name for name in ("cases", "theirs", "out"))
-    assert run("cases", folder, "-o", frozen, "--every", "4") == 0
+    assert run("cases", folder, "-o", frozen, "--every", "3") == 0
     listed = read_facts(frozen / "cases.csv")
-    held_out = [pair for pair in read_pairs(read_dataset(folder)) if pair.split == "test"][::4]
+    held_out = [pair for pair in read_pairs(read_dataset(folder)) if pair.split == "test"][::3]
     assert set(listed) == {f"{pair.subject}/{pair.index:05d}" for pair in held_out}
     for name in listed:
         assert read_image(frozen / f"light/{name}.exr").pixels.shape == (64, 128, 3)
@@ -186,16 +186,18 @@ def test_one_table_of_facerf_an_own_network_and_a_folder(
                 write_exr(path, read_image(path).pixels.repeat(2, 0).repeat(2, 1))
         truth = read_image(frozen / f"truth/{name}.exr").pixels
         write_exr(theirs / f"{name}.exr", np.broadcast_to(truth.mean((0, 1)), truth.shape))
-    use_form(OWN_NETWORK)
-    network = new_network("reflectance", OWN_NETWORK, {})
-    own = tmp_path / "own.safetensors"
-    save_networks(own, {"reflectance": network}, {"layout_version": LAYOUT_VERSION})
-    del checkpoint._CLASSES["reflectance", OWN_NETWORK]
-    line = ["--reflectance", "field", "--against", own, "--method", f"mean={theirs}", "-o", out]
-    assert run("compare", frozen, *line) == 1 and "--form" in capsys.readouterr().err
-    assert run("compare", frozen, *line, "--form", OWN_NETWORK) == 0
+    line = ["--reflectance", "field", "--method", f"mean={theirs}", "-o", out]
+    for form, name in ((OWN_NETWORK, "own"), ("my_lab.networks:Same", "other")):
+        use_form(form)
+        network, own = new_network("reflectance", form, {}), tmp_path / f"{name}.safetensors"
+        save_networks(own, {"reflectance": network}, {"layout_version": LAYOUT_VERSION})
+        del checkpoint._CLASSES["reflectance", form]
+        line += ["--against", own]
+        assert run("compare", frozen, *line) == 1 and f"--form {form}" in capsys.readouterr().err
+        line += ["--form", form]
+    assert run("compare", frozen, *line) == 0
     found = json.loads((out / "summary.json").read_text())
-    assert found["methods"] == ["field", "own", "mean"] and found["pictures"] == len(listed)
+    assert found["methods"] == ["field", "own", "other", "mean"] and found["pictures"] == len(listed)
     assert {group["fact"] for group in found["groups"]} >= {"pose", "turn", "angle", "tone"}
     assert run("olat", folder, "-o", out, "--form", "no_such:Class") == 2
     assert "--form no_such:Class" in capsys.readouterr().err

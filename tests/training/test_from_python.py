@@ -38,7 +38,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 def test_the_page_trains_by_a_loss_of_its_own(page: dict[str, Any]) -> None:
     rows = (page["folder"] / "run/log.jsonl").read_text().splitlines()
-    assert len(rows) == 20 and all('"smooth"' in row for row in rows)
+    assert len(rows) == 20 and all('"l2"' in row for row in rows)
     assert read_metadata(page["folder"] / "run/best.safetensors")["training"]
     assert page["mine"].models.checkpoint_name() == "best"
     assert page["image"].shape == page["photo"].shape and np.isfinite(page["image"]).all()
