@@ -39,8 +39,8 @@ from facerf_cli.synth.bank.texture_samples import draw_light, draw_target_lights
 
 _LOG_SCALE, _SHIFT = 0.07, (0.1, 0.03)  # standard deviations; shifts right and down in sides of the crop
 _MOST = 2.0  # standard deviations
-_STACKS_OPEN, _SOURCES_EACH = 4, 32  # stacks that take turns, and the number of sources from each
-_SOURCES_CACHED = 64  # stacks whose sources are kept, as half floats: enough for 16 samples per step
+_STACKS_OPEN, _SOURCES_EACH = 16, 8  # stacks that take turns, and the number of sources from each
+_SOURCES_CACHED = 256  # stacks whose sources are kept, as half floats: enough for 16 samples per step
 _STACKS_MEASURED = 24  # used to measure the colours of sources
 _STACKS_CACHED = 2048  # at most 32 KiB each at 512 pixels
 _SUBJECTS_AVERAGED = 16  # enough for the mean position of heads

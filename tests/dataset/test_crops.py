@@ -147,7 +147,7 @@ def test_a_stack_gives_the_sources_of_many_steps(reader: PairReader, monkeypatch
     )
     first, resumed = replace(reader), replace(reader)
     drawn = [first.draw(1, _generator_of(step), step) for step in range(130)]
-    assert len(opened) <= 6  # 4 stacks for 32 steps each, and 2 more
+    assert len(opened) <= 18  # 16 stacks for 8 steps each, and 2 more
     again = resumed.draw(1, _generator_of(70), 70)
     assert torch.equal(again.source, drawn[70].source) and torch.equal(again.target, drawn[70].target)
     assert (
