@@ -300,8 +300,9 @@ class UpsampledView:
 
     def _smooth(self, light: Tensor) -> Tensor:
         """Return shading and specular [6, S, S], continued over the background; specular is blurred."""
-        shading, specular = torch.chunk(inpaint(light, self.own), 2)
-        return self._continued(torch.cat([shading, blurred(specular, _GLOSS_PX)]))
+        shading, specular = torch.chunk(light, 2)
+        specular = blurred(inpaint(specular, self.own), _GLOSS_PX)  # the blur would mix in the background
+        return self._continued(torch.cat([shading, specular]))
 
     def _continued(self, maps: Tensor) -> Tensor:
         """Return maps [C, S, S] with edges filled and the person's values continued over the background."""
