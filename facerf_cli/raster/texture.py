@@ -221,7 +221,7 @@ def _inpaint(texture: Tensor, visible: Tensor) -> Tensor:
     coarse = coarse / weight.clamp(min=_TINY)
     filled = _inpaint(coarse, (4 * weight).clamp(max=1))  # one visible texel of four is enough
     fill = F.interpolate(filled, size=visible.shape[-2:], mode="bilinear", align_corners=False)
-    return visible * texture + (1 - visible) * fill
+    return torch.lerp(fill, texture, visible)
 
 
 def blurred(maps: Tensor, sigma_px: float) -> Tensor:
