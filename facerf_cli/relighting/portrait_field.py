@@ -266,11 +266,10 @@ class PortraitView:
         `near` are additional near lights, each with its rgb weights [M, 3].
         """
         rest, rgb = uniform_part(directions, weights)
-        far = (
-            self._far(directions[rest], weights[:, rest]) if self.uniform else self._far(directions, weights)
-        )
+        uniform = self.uniform if shining(rgb[:, None]).any() else None
+        far = self._far(directions[rest], weights[:, rest]) if uniform else self._far(directions, weights)
         sums = self._sums(len(weights), itertools.chain(far, *(self._near(*light) for light in near)))
-        return (sums.plus(self.uniform, rgb) if self.uniform else sums).shaded
+        return (sums.plus(uniform, rgb) if uniform else sums).shaded
 
     def _sums(self, count: int, batches: Iterable[_LightBatch]) -> _Sums:
         """Add up batches of single lights, corrected, for a number of sums."""
