@@ -191,7 +191,8 @@ def write_each(
     people = load_models_once(options).networks.people
     for face in fit_each(item, image, options):
         added, landmarks_px = write(face), face.fit.crop.to_photo(face.head.landmarks_px)
-        face.see(segment(people, to_display(image.pixels), landmarks_px, face.matte, face.head.others))
+        if face.facts and face.matte is None and "disputed" not in face.facts:  # not segmented by `write`
+            face.see(segment(people, to_display(image.pixels), landmarks_px, None, face.head.others))
         faces.insert(0, (face.tag, face.described() | added))
     return [tag for tag, _ in faces], facts_of([facts for _, facts in faces], options)
 

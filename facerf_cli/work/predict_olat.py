@@ -87,7 +87,9 @@ def _of_person(
     normals = read_normals(item, work.normals_from, size_px)
     choices: dict[str, Any] = {"network_alone": work.network_alone, "white_balance": work.white_balance}
     with naming(item.input_path):
-        person = fit(models, photo, matte=matte, head=head, normals=normals, **choices)
+        found = face.found if photo is image.pixels else None  # its eyes are in pixels of the whole photo
+        person = fit(models, photo, matte=matte, face=found, head=head, normals=normals, **choices)
+    face.see(person.segmentation)
     subject = person.prepare(Target(alpha=alpha, background="none"))
 
     def olats() -> Iterator[Tensor]:
