@@ -175,7 +175,7 @@ def half_floats(path: Path, values: np.ndarray) -> tuple[np.ndarray, int]:
 
 def _half(values: np.ndarray) -> np.ndarray:
     """Convert to half floats; numpy takes several times as long."""
-    return np.asarray(torch.tensor(np.ascontiguousarray(values)).half().numpy())
+    return np.asarray(torch.from_numpy(np.require(values, None, ("C", "W"))).half().numpy())
 
 
 def warn_of_clamped(path: Path, count: int) -> None:
