@@ -449,7 +449,10 @@ def _with_original_light(
 def _over(alphas: _Alphas, pixels: Sequence[np.ndarray], below: Any = _BLACK) -> np.ndarray:
     """Composite pixels [h, W, 3] of people, one after the other, over what is below, by default black."""
     for alpha, own in zip(alphas, pixels, strict=True):
-        below = below + alpha * (own - below)
+        image = own - below
+        image *= alpha
+        image += below
+        below = image
     return np.asarray(below)
 
 
