@@ -277,10 +277,10 @@ class UpsampledView:
 
         def lit(maps: Maps) -> dict[str, np.ndarray]:
             shading, specular = _read(maps["rgb"], grid).chunk(2)
-            values = {"rgb": albedo * shading + detail * specular}
+            values = {"rgb": shading.mul_(albedo).add_(specular.mul_(detail))}
             if "rear" in maps:
                 shading, specular = _read(maps["rear"], inward).chunk(2)
-                values["rear"] = (albedo * shading + detail * specular) * brightness
+                values["rear"] = shading.mul_(albedo).add_(specular.mul_(detail)).mul_(brightness)
             if original is not None and finer is not None:
                 values["change"] = _change(maps, grid, finer) / original
             if "albedo" in maps:
