@@ -341,9 +341,9 @@ def solid(matte: np.ndarray, loose: np.ndarray) -> np.ndarray:
     deep = [
         ((distance_transform_edt(part) - first) / (last - first)).clip(0, 1) for part in (inside, ~inside)
     ]
-    result = np.empty_like(matte)
+    changed, result = np.stack(deep) * tight, np.empty_like(matte)
     for rows in strips(matte.shape):
-        filled, cleared = enlarged(np.stack(deep) * tight, matte.shape, rows)
+        filled, cleared = enlarged(changed, matte.shape, rows)
         sure = ((matte[rows] - _SURE[0]) / (_SURE[1] - _SURE[0])).clip(0, 1)
         result[rows] = (sure + filled * (1 - sure)) * (1 - cleared)
     return result
