@@ -130,8 +130,7 @@ def read_image(
     bad = 0
     for rows in strips(values.shape):
         channels = values[rows][..., used]
-        finite = np.isfinite(channels)
-        if not finite.all():
+        if values.dtype.kind == "f" and not (finite := np.isfinite(channels)).all():
             bad += int((~finite).any(-1).sum())
             channels = np.where(finite, channels, np.float32(0))
         colour = np.broadcast_to(channels[..., : len(image.colour)], pixels[rows].shape)
