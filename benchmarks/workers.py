@@ -127,8 +127,8 @@ def rate_of(done_s: Sequence[float], workers: int) -> float:
 
 
 def digest_of(out: Path) -> str:
-    """Digest the path and bytes of every file except reports, which hold times."""
-    files = sorted(path for path in out.rglob("*") if path.is_file() and not path.match("report*.jsonl"))
+    """Digest the path and bytes of every file except journals, which hold times."""
+    files = sorted(path for path in out.rglob("*") if path.is_file() and path.suffix != ".jsonl")
     parts = [f"{path.relative_to(out)} {hashlib.sha256(path.read_bytes()).hexdigest()}" for path in files]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
