@@ -12,7 +12,7 @@ from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.image.strips import resized
 from facerf_cli.light.entries import StudioLight
-from facerf_cli.light.light import Light
+from facerf_cli.light.light import UNIFORM_LIGHTS, Light
 from facerf_cli.light.over_rig import as_lit, lights_over_rig, with_ambient
 from facerf_cli.light.setups import LightSetup, LightSources, collect_setups, set_ambient
 from facerf_cli.main import main
@@ -46,7 +46,7 @@ def lights_of(*setups: LightSetup) -> Light:
 def test_a_named_light_is_one_of_the_sums_that_it_shines_in() -> None:
     (setup,) = setups_of([KEY, RIM])
     found = lights_over_rig(as_lit((replace(setup, ambient=0.1),), 0), "150", "cell")
-    assert len(found.weights) == 4 and len(found.directions) == 2 + 24  # of the ambient fill
+    assert len(found.weights) == 4 and len(found.directions) == 2 + UNIFORM_LIGHTS
     torch.testing.assert_close(found.weights[0], found.weights[1:].sum(0))
 
 
