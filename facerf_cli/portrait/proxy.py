@@ -29,7 +29,7 @@ from facerf_cli.network.portrait import SKIN
 from facerf_cli.portrait.parse import class_index
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
-from facerf_cli.raster.texture import blurred, inpaint, vertex_normals
+from facerf_cli.raster.texture import Inpainting, blurred, inpaint, vertex_normals
 from facerf_cli.run.threads import in_threads
 
 ASSET = Path(__file__).parents[1] / "assets" / "proxy_person.safetensors"
@@ -136,7 +136,7 @@ class Shadows:
     """
 
     def __init__(self, proxy: Proxy, maps: ProxyMaps) -> None:
-        self.covered, self._inside = maps.covered, maps.covered.numpy() > 0
+        self._inside, self._inpainted = maps.covered.numpy() > 0, Inpainting(maps.covered)
         normals, points = (field.numpy()[:, self._inside].T for field in (maps.normals, maps.positions_m))
         self.origins = (points + OFF_M * normals).astype(np.float32)
         self._scene = proxy.scene
@@ -176,7 +176,7 @@ class Shadows:
             visible[number, self._inside] = 1 - np.mean(blocked, 0)
 
         list(in_threads(trace, range(lights)))
-        return blurred(inpaint(torch.from_numpy(visible), self.covered), _SOFT_PX)
+        return blurred(self._inpainted(torch.from_numpy(visible)), _SOFT_PX)
 
 
 def _with_hair(vertices: Tensor, hair: Tensor, camera: Camera, classes: Tensor) -> Tensor:

@@ -209,19 +209,35 @@ def inpaint(texture: Tensor, visible: Tensor) -> Tensor:
 
     `visible` [..., T, T] in 0..1 is the weight of each texel; fully visible texels stay unchanged.
     """
-    filled = _inpaint(texture.reshape(-1, *texture.shape[-3:]), visible.reshape(-1, 1, *visible.shape[-2:]))
-    return filled.view_as(texture)
+    return Inpainting(visible)(texture)
 
 
-def _inpaint(texture: Tensor, visible: Tensor) -> Tensor:
-    if max(visible.shape[-2:]) == 1:
-        return texture * (visible > 0)
-    weight = F.avg_pool2d(visible, 2, ceil_mode=True, count_include_pad=False)
-    coarse = F.avg_pool2d(texture * visible, 2, ceil_mode=True, count_include_pad=False)
-    coarse = coarse / weight.clamp(min=_TINY)
-    filled = _inpaint(coarse, (4 * weight).clamp(max=1))  # one visible texel of four is enough
-    fill = F.interpolate(filled, size=visible.shape[-2:], mode="bilinear", align_corners=False)
-    return torch.lerp(fill, texture, visible)
+class Inpainting:
+    """`inpaint` of several textures with the same visibility [..., T, T]."""
+
+    def __init__(self, visible: Tensor) -> None:
+        self._levels = list[tuple[Tensor, Tensor]]()  # visibility, and its mean over 2 x 2 texels
+        visible = visible.reshape(-1, 1, *visible.shape[-2:])
+        while max(visible.shape[-2:]) > 1:
+            weight = _mean_of_four(visible)
+            self._levels.append((visible, weight.clamp(min=_TINY)))
+            visible = (4 * weight).clamp(max=1)  # one visible texel of four is enough
+        self._any = visible > 0
+
+    def __call__(self, texture: Tensor) -> Tensor:
+        """Fill a texture [..., C, T, T]."""
+        coarser = [texture.reshape(-1, *texture.shape[-3:])]
+        for visible, weight in self._levels:
+            coarser.append(_mean_of_four(coarser[-1] * visible) / weight)
+        filled = coarser.pop() * self._any
+        for (visible, _), seen in zip(reversed(self._levels), reversed(coarser), strict=True):
+            fill = F.interpolate(filled, size=visible.shape[-2:], mode="bilinear", align_corners=False)
+            filled = torch.lerp(fill, seen, visible)
+        return filled.view_as(texture)
+
+
+def _mean_of_four(maps: Tensor) -> Tensor:
+    return F.avg_pool2d(maps, 2, ceil_mode=True, count_include_pad=False)
 
 
 def blurred(maps: Tensor, sigma_px: float) -> Tensor:

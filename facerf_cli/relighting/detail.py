@@ -28,7 +28,7 @@ from facerf_cli.face.topology import region_mask
 from facerf_cli.face.view import FaceView
 from facerf_cli.image.colour import luminance
 from facerf_cli.image.strips import Window
-from facerf_cli.raster.texture import blurred_within, inpaint
+from facerf_cli.raster.texture import Inpainting, blurred_within
 
 NOISE = 0.03  # radiance of skin in the maps below which colour is noise, as a fraction of its mean
 FLOOR = 0.01  # f, and the same limit in hair
@@ -114,7 +114,8 @@ class FaceDetail:
         self._skin = face.visible * (1 - own)
         self._typical = mean_colour(face.texture, self._skin) + TINY
         least = _LEAST_AROUND * float(self._typical.mean())
-        self._around_source = inpaint(face.texture, self._skin).clamp(min=least)
+        self._around_skin = Inpainting(self._skin)
+        self._around_source = self._around_skin(face.texture).clamp(min=least)
         self._source = torch.cat([face.texture, own[None]])
 
     def precompute(self, texture: Tensor, mouth: Tensor | None = None) -> Tensor:
@@ -122,9 +123,9 @@ class FaceDetail:
 
         `mouth` [3, T, T] is the face relit by the light that enters the mouth.
         """
-        around = inpaint(texture, self._skin)
+        around = self._around_skin(texture)
         if mouth is not None:
-            around = torch.lerp(around, inpaint(mouth, self._skin), _CAVITY * self._mouth)
+            around = torch.lerp(around, self._around_skin(mouth), _CAVITY * self._mouth)
         return torch.cat([texture, around / self._around_source])
 
     def over(self, part: Window, photo: np.ndarray) -> Callable[[Tensor], np.ndarray]:

@@ -35,7 +35,7 @@ from facerf_cli.image.strips import Window, enlarged, fitted
 from facerf_cli.portrait.matte import shrunk
 from facerf_cli.portrait.parse import class_index
 from facerf_cli.raster.camera import PIXEL_CENTRE
-from facerf_cli.raster.texture import blurred, inpaint, smoothstep
+from facerf_cli.raster.texture import Inpainting, blurred, smoothstep
 from facerf_cli.relighting.cast_shadows import CastShadow, change
 from facerf_cli.relighting.detail import finer_detail
 from facerf_cli.relighting.portrait_field import PersonShading, PortraitView
@@ -205,6 +205,7 @@ class UpsampledView:
         self._view = view
         classes = view.person.classes
         self.own = view.person.own_pixels
+        self._inpainted = Inpainting(self.own)
         self._unit, self._typical_skin = view.person.exposure, view.typical_skin
         self._colours = colours_of(view.person.exposed)
         hair, solid = (
@@ -301,12 +302,12 @@ class UpsampledView:
     def _smooth(self, light: Tensor) -> Tensor:
         """Return shading and specular [6, S, S], continued over the background; specular is blurred."""
         shading, specular = torch.chunk(light, 2)
-        specular = blurred(inpaint(specular, self.own), _GLOSS_PX)  # the blur would mix in the background
+        specular = blurred(self._inpainted(specular), _GLOSS_PX)  # the blur would mix in the background
         return self._continued(torch.cat([shading, specular]))
 
     def _continued(self, maps: Tensor) -> Tensor:
         """Return maps [C, S, S] with edges filled and the person's values continued over the background."""
-        return inpaint(self._edges.filled(maps), self.own)
+        return self._inpainted(self._edges.filled(maps))
 
     def _grid(self, window: Window) -> Tensor:
         """Return the coordinates [h, w, 2] in the maps, in -1..1, of pixels of the photo."""
