@@ -23,7 +23,7 @@ from facerf_cli.network.base import Blocks, Classes, Side, WidthsOfFour
 from facerf_cli.network.batch import Batch
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.network.parsing import Residual, UNet
-from facerf_cli.raster.texture import smoothstep
+from facerf_cli.raster.texture import Pixels, smoothstep
 
 SKIN = 1  # index of the class whose mean exposes the image
 HAIRY = (2, 6, 7)  # brows, hair and beard
@@ -113,7 +113,8 @@ def skin_exposure(image: Tensor, classes: Tensor) -> Tensor:
 class PortraitMaps(NamedTuple):
     """Maps of B people, [B, C, S, S]; the last three have half the side.
 
-    Albedo is in the units of the exposed image; hair is the fraction covered by strands.
+    Albedo is in the units of the exposed image; hair is the fraction covered by strands. Maps `at` some
+    pixels all have one row, [B, C, 1, N].
     """
 
     gain: Tensor
@@ -148,6 +149,11 @@ class PortraitMaps(NamedTuple):
             strands=F.normalize(self.strands + alike * other.strands, dim=1),
         )
 
+    def at(self, pixels: Pixels) -> "PortraitMaps":
+        """Return the maps at some pixels."""
+        size = self.normals.shape[-2:]
+        return PortraitMaps(*(pixels.values(_enlarged(maps, size)) for maps in self))
+
     def without_colours(self) -> "PortraitMaps":
         """Return maps with grey gain, bias and albedo, for grey photos."""
         grey = {name: getattr(self, name).mean(1, keepdim=True) for name in ("gain", "bias", "albedo")}
@@ -157,17 +163,15 @@ class PortraitMaps(NamedTuple):
         """Return shading, highlights and corrected visibility [B, L, S, S] under lights [B, L, 3].
 
         `visible` [B, L, S, S] is the proxy's visibility. The image of a light is albedo times shading plus
-        highlights. Near lights have a direction per pixel, [B, L, S, S, 3].
+        highlights. Near lights have a direction per pixel, [B, L, 1, N, 3], and require the maps `at` them.
         """
-        near = lights.dim() == 5
-        product = "blijc,bcij->blij" if near else "blc,bcij->blij"
-        basis = sh_basis(_halved(lights) if near else lights, SHADOW_ORDER)  # [B, L, K] or [B, L, s, s, K]
+        product = "blijc,bcij->blij" if lights.dim() == 5 else "blc,bcij->blij"
+        basis = sh_basis(lights, SHADOW_ORDER)  # [B, L, K] or [B, L, 1, N, K]
         few = basis[..., : (LIT_ORDER + 1) ** 2]
         size = self.normals.shape[-2:]
 
         def over(basis: Tensor, maps: Tensor) -> Tensor:
-            coarse = torch.einsum(product, basis, maps)
-            return F.interpolate(coarse, size=size, mode="bilinear", align_corners=False)
+            return _enlarged(torch.einsum(product, basis, maps), size)
 
         visible = torch.sigmoid(self.trust * (2 * visible - 1) + over(basis, self.shadow))
         cosine = torch.einsum(product, lights, self.normals)
@@ -189,11 +193,11 @@ class PortraitMaps(NamedTuple):
         return self.albedo[:, None] * shading[:, :, None] + glow[:, :, None]
 
 
-def _halved(directions: Tensor) -> Tensor:
-    """Return unit directions [B, L, S, S, 3] at half the side."""
-    people, lights, side = directions.shape[:3]
-    blocks = directions.view(people, lights, side // 2, 2, side // 2, 2, 3)
-    return F.normalize(blocks.mean((3, 5)), dim=-1)
+def _enlarged(maps: Tensor, size: torch.Size) -> Tensor:
+    """Return maps [B, C, h, w] at another size [H, W]."""
+    if maps.shape[-2:] == size:
+        return maps
+    return F.interpolate(maps, size=size, mode="bilinear", align_corners=False)
 
 
 class PortraitNetwork(UNet):

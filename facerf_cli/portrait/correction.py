@@ -20,12 +20,13 @@ edges would be stairs at the photo's resolution.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.raster.texture import blurred_within
+from facerf_cli.raster.texture import Pixels, blurred_within
 
 _FLOOR = 0.05  # f, relative to the person's mean in the photo
 _RANGE = (0.2, 5.0)  # of Q
@@ -41,20 +42,24 @@ _FACE_SHARPNESS = 8.0  # exponent of the likeness: higher values correct fewer l
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """Q - 1 [3, S, S], p [S, S], the floor f, the mean of E over the person, and E [S, S], grey."""
+    """Q - 1 [3, 1, N], p [1, N], the floor f, the mean of E over the person, and E [1, N], grey.
+
+    All images are values of N pixels of maps, which include the person.
+    """
 
     excess: Tensor
     mean_likeness: Tensor
     floor: float
     mean: float
     explained: Tensor
-    person: Tensor  # [S, S]
+    person: Tensor  # [1, N]
+    pixels: Pixels
 
     @staticmethod
-    def of(photo: Tensor, olats: Tensor, weights: Tensor, person: Tensor) -> "Correction":
-        """Correct images [L, 3, S, S] whose sum with weights [L, 3] explains a photo [3, S, S].
+    def of(photo: Tensor, olats: Tensor, weights: Tensor, person: Tensor, pixels: Pixels) -> "Correction":
+        """Correct images [L, 3, 1, N] whose sum with weights [L, 3] explains a photo [3, 1, N].
 
-        person [S, S] is the person's coverage of each pixel.
+        person [1, N] is the person's coverage of each pixel.
         """
         explained = torch.einsum("lc,lcij->cij", weights, olats)
         total = person.sum().clamp_min(1.0)
@@ -65,8 +70,9 @@ class Correction:
         coloured = brightness**2 / (brightness**2 + (_DARK * floor) ** 2).clamp_min(1e-12)
         ratio = torch.lerp(grey, ratio, coloured).clamp(*_RANGE)
         mean = float((explained.mean(0) * person).sum() / total)
-        excess = blurred_within(ratio - 1, person, _BLUR_PX) * person
-        plain = Correction(excess, torch.ones_like(person), floor, mean, explained.mean(0), person)
+        blurred = blurred_within(pixels.maps(ratio - 1), pixels.maps(person), _BLUR_PX)
+        excess = pixels.values(blurred) * person
+        plain = Correction(excess, torch.ones_like(person), floor, mean, explained.mean(0), person, pixels)
         grey = olats.mean(1)
         brightness = plain._brightness(grey)
         likeness = plain._likeness(grey, brightness)
@@ -75,7 +81,7 @@ class Correction:
         return replace(plain, mean_likeness=mean_likeness.clamp_min(1e-3))
 
     def terms(self, grey: Tensor) -> tuple[Tensor, Tensor]:
-        """Return factors and additions [3, l, S, S] that correct single-light images, grey ones [l, S, S]."""
+        """Return factors and additions [3, l, 1, N] that correct single-light images, grey ones [l, 1, N]."""
         brightness = self._brightness(grey)
         power = self._likeness(grey, brightness) / self.mean_likeness
         power, raised = power.clamp(max=_LARGEST), self.floor * brightness
@@ -90,19 +96,22 @@ class Correction:
         return (means / max(self.mean, 1e-9))[:, None, None]
 
     def _likeness(self, grey: Tensor, brightness: Tensor) -> Tensor:
-        """Return p_l [l, S, S]."""
-        small, explained = _small(grey, self.person), _small(self.explained, self.person)
+        """Return p_l [l, 1, N]."""
+        small, explained = self._small(grey), self._small_explained
         lengths = small.flatten(-2).norm(dim=-1) * explained.norm()
         cosine = (small * explained).sum((-2, -1)) / lengths.clamp_min(1e-12)
         allowed = brightness * (self.explained + self.floor)
         brighter = (grey + self.floor * brightness) / allowed.clamp_min(1e-9)
         return cosine.clamp(0, 1)[:, None, None] ** _SHARPNESS / brighter.clamp_min(1)
 
+    @cached_property
+    def _small_explained(self) -> Tensor:
+        return self._small(self.explained[None])
 
-def _small(grey: Tensor, person: Tensor) -> Tensor:
-    """Resize grey images [n, S, S] or [S, S] over the person to [n, s, s]."""
-    masked = (grey * person).reshape(1, -1, *person.shape)
-    return F.interpolate(masked, (_SMALL_PX, _SMALL_PX), mode="area")[0]
+    def _small(self, grey: Tensor) -> Tensor:
+        """Reduce grey images [n, 1, N] of the person to [n, s, s]."""
+        masked = self.pixels.maps(grey * self.person)
+        return F.interpolate(masked[None], (_SMALL_PX, _SMALL_PX), mode="area")[0]
 
 
 @dataclass(frozen=True)

@@ -249,3 +249,26 @@ def blurred_within(maps: Tensor, weight: Tensor, sigma_px: float) -> Tensor:
     """Average maps [C, H, W] by a Gaussian with weights [H, W]; 0 where these are 0."""
     both = blurred(torch.cat([maps * weight, weight[None]]), sigma_px)
     return both[:-1] / both[-1:].clamp_min(1e-6)
+
+
+@dataclass(frozen=True, eq=False)
+class Pixels:
+    """Some pixels of maps [..., S, S]; their values are maps of one row, [..., 1, N]."""
+
+    numbers: Tensor  # [N], row by row
+    side: int
+
+    @staticmethod
+    def of(chosen: Tensor) -> "Pixels":
+        """Choose pixels by a mask [S, S]."""
+        return Pixels(chosen.flatten().nonzero()[:, 0], chosen.shape[-1])
+
+    def values(self, maps: Tensor) -> Tensor:
+        """Return the values [..., 1, N] of maps [..., S, S]."""
+        return maps.flatten(-2).index_select(-1, self.numbers)[..., None, :]
+
+    def maps(self, values: Tensor) -> Tensor:
+        """Return maps [..., S, S] of values [..., 1, N], 0 at other pixels."""
+        maps = values.new_zeros(*values.shape[:-2], self.side, self.side)
+        maps.flatten(-2).index_copy_(-1, self.numbers, values[..., 0, :])
+        return maps

@@ -46,17 +46,18 @@ class CastShadow(NamedTuple):
 
 def cast_shadow(view: PortraitView, light: Tensor | PointLights) -> CastShadow:
     """Compute the shadow of a light in a view; the light is directions [n, 3] of its samples, or points."""
-    person, size = view.person, view.person.image.shape[1:]
+    person, pixels, seen = view.person, view.pixels, view.shaded_maps
     if isinstance(light, PointLights):
-        ends, (lights, strength) = light.places_m, light.arriving(person.maps.positions_m)
+        ends, (lights, strength) = light.places_m, light.arriving(pixels.values(person.maps.positions_m))
         coarse, middle = person.shadows.toward(ends), -light.toward
     else:
         ends, lights, strength = light, light, torch.full((len(light), 1, 1), 1 / len(light))
         coarse, middle = person.shadows.along(light), F.normalize(light.mean(0), dim=0)
     shades = []
     for visible in (0.0, 1.0):
-        shading, specular, _ = view.maps.shaded(lights[None], torch.full((1, len(coarse), *size), visible))
-        radiance = view.maps.albedo[0].mean(0) * shading[0] + specular[0]
+        everywhere = torch.full((1, len(coarse), *seen.hair.shape[2:]), visible)
+        shading, specular, _ = seen.shaded(lights[None], everywhere)
+        radiance = seen.albedo[0].mean(0) * shading[0] + specular[0]
         shades.append((strength * radiance).sum(0))
     maps = person.finer
     wide = _enlarged(coarse.mean(0), maps.covered)
@@ -68,9 +69,8 @@ def cast_shadow(view: PortraitView, light: Tensor | PointLights) -> CastShadow:
     fine = wide.clone()
     fine[traced] = visibility(person.proxy, maps, traced, wide, ends, isinstance(light, PointLights))
     fine = F.avg_pool2d(fine[None], _PATTERN, 1, _PATTERN // 2, count_include_pad=False)[0]
-    return CastShadow(
-        torch.stack([torch.lerp(wide, fine, weight), wide]), inpaint(torch.stack(shades), person.own_pixels)
-    )
+    shade = inpaint(pixels.maps(torch.stack(shades)), person.own_pixels)
+    return CastShadow(torch.stack([torch.lerp(wide, fine, weight), wide]), shade)
 
 
 def visibility(

@@ -203,13 +203,21 @@ def weighted_sum(batches: Iterable[Tensor], weights: Tensor) -> Tensor:
 
     Textures are summed before they are rendered, because rendering costs more. Only one batch is in memory.
     """
-    total, done = torch.zeros(()), 0
+    total, size, done = torch.zeros(()), torch.Size(), 0
     for olats in batches:
+        if not done:
+            total, size = olats.new_zeros(3, len(weights), olats[0, 0].numel()), olats.shape[2:]
         part = weights[:, done : done + len(olats)]
-        flat = torch.einsum("mlc,lcn->mcn", part, olats.flatten(2))
-        total = total + flat.view(*flat.shape[:2], *olats.shape[2:])
+        add_weighted(total, part.permute(2, 0, 1), olats.flatten(2).transpose(0, 1))
         done += len(olats)
-    return total
+    return total.transpose(0, 1).view(len(weights), 3, *size)
+
+
+def add_weighted(sums: Tensor, weights: Tensor, lights: Tensor) -> None:
+    """Add images of lights [C, L, N] with weights [C, M, L] to M sums [C, M, N], in place."""
+    used = (weights != 0).any(0).any(1) | weights.requires_grad
+    rows = used.nonzero()[:, 0]
+    sums.index_add_(1, rows, weights[:, rows] @ lights)
 
 
 _APART_DEG, _MOST_STEPS = 10.0, 3  # of the grid, and steps from its middle; wider patches have wider steps

@@ -29,16 +29,17 @@ from facerf_cli.portrait.person import SeenPerson
 from facerf_cli.portrait.proxy import square_camera
 from facerf_cli.portrait.segment import Segmentation
 from facerf_cli.raster.camera import project
-from facerf_cli.raster.texture import bake_attributes, blurred, smoothstep
+from facerf_cli.raster.texture import Pixels, bake_attributes, blurred, smoothstep
 from facerf_cli.relighting.detail import FLOOR, NOISE, contrast, finer_detail, lost_detail, mean_colour
 from facerf_cli.relighting.eyes import mirrored_in_cornea
-from facerf_cli.relighting.field import Field, shining
+from facerf_cli.relighting.field import Field, add_weighted, shining
 from facerf_cli.relighting.photo_light import SourceLight, key_light_fraction
 from facerf_cli.relighting.white import BARE, WhiteBalance, even_shade_of, without_baked_in
 from facerf_cli.run.threads import in_threads
 
 _SUMMARY_LIGHTS = 48  # lights of the rig whose shadows the network sees
-_LIGHTS_AT_ONCE = 16
+_LIGHTS_AT_ONCE = 4  # more leave the processor's cache
+_LEAST_COVERED, _AROUND_PX = 0.02, 2  # coverage of a person's pixels, and shaded pixels around them
 _PORTRAIT_WEIGHT = 0.4  # weight of the portrait field in the face, where the face field is finer
 _SKIN = class_index("skin")
 _APART = 0.01  # blur of everything but skin, as a fraction of the square: skin near it keeps make-up and hair
@@ -93,42 +94,56 @@ class SmoothedFrame:
 
 
 class _Sums(NamedTuple):
-    """Sums of single lights for a `PersonShading`: [M, 3, S, S], `rear` [M, 6, S, S]."""
+    """M sums of single lights at N pixels, for a `PersonShading`: [3, M, N]."""
 
     shading: Tensor
     specular: Tensor
     arriving: Tensor
-    unshadowed: Tensor
-    rear: Tensor
-    gradient: Tensor | None  # [M, 9, S, S]
+    unshadowed: Tensor  # [3, M, 1] without near lights
+    rear: Tensor | None = None  # [6, M, N]; None: no light comes from behind
+    gradient: Tensor | None = None  # [9, M, N]
 
     def plus(self, one: "_Sums", rgb: Tensor) -> "_Sums":
         """Add another sum, M = 1, times rgb [M, 3]."""
-        factors = (*[rgb] * 4, rgb.repeat(1, 2))
-        shading, specular, arriving, unshadowed, rear = (
-            a + factor[..., None, None] * b for a, b, factor in zip(self[:5], one[:5], factors, strict=True)
+        factor = rgb.T[..., None]
+        shading, specular, arriving, unshadowed = (
+            torch.addcmul(a, factor, b) for a, b in zip(self[:4], one[:4], strict=True)
         )
-        gradient = self.gradient
+        rear, gradient = self.rear, self.gradient
+        if one.rear is not None:
+            from_behind = factor.repeat(2, 1, 1) * one.rear
+            rear = from_behind if rear is None else rear + from_behind
         if gradient is not None and one.gradient is not None:
-            gradient = gradient + rgb.repeat_interleave(3, 1)[..., None, None] * one.gradient
+            gradient = torch.addcmul(gradient, factor.repeat_interleave(3, 0), one.gradient)
         return _Sums(shading, specular, arriving, unshadowed, rear, gradient)
 
-    @property
-    def shaded(self) -> PersonShading:
-        visibility = self.arriving / self.unshadowed.clamp_min(1e-6)
-        return PersonShading(self.shading, self.specular, visibility, self.rear, self.gradient)
+    def shaded(self, pixels: Pixels) -> PersonShading:
+        """Return the maps of these pixels."""
+
+        def maps(sums: Tensor) -> Tensor:
+            return pixels.maps(sums.transpose(0, 1)[:, :, None])
+
+        shading, specular = maps(self.shading), maps(self.specular)
+        dark = shading.new_zeros(()).expand(len(shading), 6, *shading.shape[2:])
+        return PersonShading(
+            shading,
+            specular,
+            maps(self.arriving / self.unshadowed.clamp_min(1e-6)),
+            dark if self.rear is None else maps(self.rear),
+            None if self.gradient is None else maps(self.gradient),
+        )
 
 
 class _LightBatch(NamedTuple):
-    """Maps of one batch of single lights."""
+    """One batch of single lights at N pixels."""
 
-    shading: Tensor  # [l, S, S]
-    specular: Tensor  # [l, S, S]
-    irradiance: Tensor  # [l, S, S]
-    unshadowed: Tensor  # irradiance without shadows
+    shading: Tensor  # [l, 1, N]
+    specular: Tensor  # [l, 1, N]
+    irradiance: Tensor  # [l, 1, N]
+    unshadowed: Tensor  # irradiance without shadows, [l, 1, 1] or [l, 1, N]
     weights: Tensor  # [M, l, 3]
     rear: Tensor  # [l] fraction of each light that comes from behind
-    toward: Tensor  # [l, 3, 1, 1] or [l, 3, S, S] directions
+    toward: Tensor  # [l, 3, 1, 1] or [l, 3, 1, N] directions
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +153,7 @@ class PortraitView:
     person: SeenPerson
     maps: PortraitMaps  # batch of 1; the albedo is in the units of the network's input
     exposure: Tensor  # radiance of the photo over the maps' radiance in the photo's light, [3, 1, 1]
+    pixels: Pixels  # that are shaded; the others stay black
     correction: Correction | None = None  # ratio image
     uniform: _Sums | None = None  # of uniform light of rgb 1, M = 1
     original: PersonShading | None = None  # shading in the photo's light, if the user supplied normals
@@ -148,8 +164,12 @@ class PortraitView:
         maps: PortraitMaps,
         source: SourceLight | None,
         balance: WhiteBalance | None = None,
+        texels: Tensor | None = None,
     ) -> "PortraitView":
-        view = PortraitView(person, maps, torch.full((3, 1, 1), person.exposure))._with_detail()
+        """Return the view of a person; texels [T, T, 2] of the face that lie in it are shaded as well."""
+        pixels = _shaded_pixels(person, texels)
+        exposure = torch.full((3, 1, 1), person.exposure)
+        view = PortraitView(person, maps, exposure, pixels)._with_detail()
         if source is None:
             return view.with_white_balance(balance)
         view = view._fit_to_photo(source, balance)
@@ -167,6 +187,16 @@ class PortraitView:
 
     def _with_albedo(self, gains: Tensor) -> "PortraitView":
         return replace(self, maps=self.maps._replace(albedo=self.maps.albedo * gains))
+
+    @cached_property
+    def shaded_maps(self) -> PortraitMaps:
+        """The maps at the shaded pixels."""
+        return self.maps.at(self.pixels)
+
+    @property
+    def _albedo(self) -> Tensor:
+        """Albedo [3, 1, N] of the shaded pixels."""
+        return self.pixels.values(self.maps.albedo[0])
 
     @property
     def typical_skin(self) -> Tensor:
@@ -191,15 +221,15 @@ class PortraitView:
         """
         directions, weights = source.light.directions, source.light.weights
         shading, specular, visibility = self._single_lights(directions, self.person.shadows.along(directions))
-        olats = self.maps.albedo * shading[:, None] + specular[:, None]
-        skin = self.person.classes[_SKIN]
+        classes, image = (self.pixels.values(maps) for maps in (self.person.classes, self.person.image))
+        olats = self._albedo * shading[:, None] + specular[:, None]
         explained = torch.einsum("lc,lcij->cij", weights, olats)
-        photo, relit = ((image * skin).sum((1, 2), True) for image in (self.person.image, explained))
+        photo, relit = ((one * classes[_SKIN]).sum((1, 2), True) for one in (image, explained))
         exposure = photo / relit.clamp_min(1e-6)  # the colour of the photo's light is preserved
         plain = replace(self, exposure=exposure)
-        plain = plain._without_baked_in(shading[0], key_light_fraction(source.light))
-        olats = plain.maps.albedo * shading[:, None] + specular[:, None]
-        correction = Correction.of(self.person.image / exposure, olats, weights, 1 - self.person.classes[0])
+        plain = plain._without_baked_in(self.pixels.maps(shading[0]), key_light_fraction(source.light))
+        olats = plain._albedo * shading[:, None] + specular[:, None]
+        correction = Correction.of(image / exposure, olats, weights, 1 - classes[0], self.pixels)
         share = torch.full((1, len(directions), 3), 4 / UNIFORM_LIGHTS)
         parts = [slice(first, first + _LIGHTS_AT_ONCE) for first in range(1, len(share[0]), _LIGHTS_AT_ONCE)]
         ambient = [
@@ -220,13 +250,13 @@ class PortraitView:
         return self._with_albedo(balance.gains(uniform, person.image, person.classes))
 
     def _single_lights(self, lights: Tensor, visible: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return shading, specular and visibility [l, S, S] of single lights, given the proxy's visibility.
+        """Return shading, specular and visibility [l, 1, N] of single lights, given the proxy's visibility.
 
-        Lights of rgb 1 are directions [l, 3], or [l, S, S, 3] per pixel.
+        Lights of rgb 1 are directions [l, 3], or [l, 1, N, 3] per pixel.
         """
         size = self.person.image.shape[1:]
         wide = F.interpolate(visible[None], size=size, mode="bilinear", align_corners=False)
-        shading, specular, visibility = self.maps.shaded(lights[None], wide)
+        shading, specular, visibility = self.shaded_maps.shaded(lights[None], self.pixels.values(wide))
         return shading[0], specular[0], visibility[0]
 
     def _far(self, directions: Tensor, weights: Tensor) -> Iterator[_LightBatch]:
@@ -241,7 +271,7 @@ class PortraitView:
                 yield _far_batch(lights, part, self._single_lights(lights, visible))
 
     def _near(self, points: PointLights, weights: Tensor) -> Iterator[_LightBatch]:
-        toward, irradiance = points.arriving(self.person.maps.positions_m)
+        toward, irradiance = points.arriving(self.pixels.values(self.person.maps.positions_m))
         rear = rear_fraction(-points.toward)
         for first in range(0, len(toward), _LIGHTS_AT_ONCE):
             batch = slice(first, first + _LIGHTS_AT_ONCE)
@@ -269,35 +299,37 @@ class PortraitView:
         uniform = self.uniform if shining(rgb[:, None]).any() else None
         far = self._far(directions[rest], weights[:, rest]) if uniform else self._far(directions, weights)
         sums = self._sums(len(weights), itertools.chain(far, *(self._near(*light) for light in near)))
-        return (sums.plus(uniform, rgb) if uniform else sums).shaded
+        return (sums.plus(uniform, rgb) if uniform else sums).shaded(self.pixels)
 
     def _sums(self, count: int, batches: Iterable[_LightBatch]) -> _Sums:
         """Add up batches of single lights, corrected, for a number of sums."""
-        size = self.person.image.shape
-        shading, specular, arriving, unshadowed = torch.zeros(4, count, *size).unbind(0)
-        albedo = self.maps.albedo[0].mean(0)
-        rear = torch.zeros(count, 6, *size[1:])
-        gradient = None if self.person.normals is None else torch.zeros(count, 9, *size[1:])
+        albedo, count_px = self._albedo.mean(0), len(self.pixels.numbers)
+        shading, specular, arriving = (torch.zeros(3, count, count_px) for _ in range(3))
+        unshadowed, rear = torch.zeros(3, count, 1), None
+        gradient = None if self.person.normals is None else torch.zeros(9, count, count_px)
         for batch in batches:
             shades, speculars = (x.expand(3, *x.shape) for x in (batch.shading, batch.specular))
             factor = torch.ones(3, 1, 1, 1)
             if self.correction is not None:
                 factor, added = self.correction.terms(albedo * batch.shading + batch.specular)
-                shades, speculars = shades * factor, torch.addcmul(added, batch.specular, factor)
-            from_rear = batch.weights * batch.rear[:, None]
-            front = batch.weights - from_rear
-            shading = shading + torch.einsum("mlc,clij->mcij", front, shades)
-            specular = specular + torch.einsum("mlc,clij->mcij", front, speculars)
+                shades, speculars = shades * factor, added.addcmul_(batch.specular, factor)
+            shades, speculars = shades.flatten(2), speculars.flatten(2)
+            weights = batch.weights.permute(2, 0, 1)  # [3, M, l]
+            behind = weights * batch.rear
+            front = weights - behind
+            add_weighted(shading, front, shades)
+            add_weighted(specular, front, speculars)
+            add_weighted(arriving, weights, batch.irradiance.flatten(1).expand(3, -1, -1))
+            unshadowed = unshadowed + weights @ batch.unshadowed.flatten(1)
             if gradient is not None:
-                facing = (batch.toward * self.maps.normals).sum(1) > 0
-                slopes = factor * batch.irradiance * facing
-                change = torch.einsum("mlc,clij,lkij->mckij", front, slopes, batch.toward)
-                gradient = gradient + change.flatten(1, 2)
+                facing = (batch.toward * self.shaded_maps.normals).sum(1) > 0
+                slopes = (factor * batch.irradiance * facing).flatten(2)
+                toward = batch.toward.flatten(2).expand(-1, -1, count_px)
+                gradient += torch.einsum("cml,cln,lkn->ckmn", front, slopes, toward).flatten(0, 1)
             if batch.rear.any():
-                both = [torch.einsum("mlc,clij->mcij", from_rear, part) for part in (shades, speculars)]
-                rear = rear + torch.cat(both, 1)
-            arriving = arriving + torch.einsum("mlc,lij->mcij", batch.weights, batch.irradiance)
-            unshadowed = unshadowed + torch.einsum("mlc,lij->mcij", batch.weights, batch.unshadowed)
+                rear = torch.zeros(6, count, count_px) if rear is None else rear
+                add_weighted(rear[:3], behind, shades)
+                add_weighted(rear[3:], behind, speculars)
         return _Sums(shading, specular, arriving, unshadowed, rear, gradient)
 
     def eye_reflections(self, lights: Light, centre_m: Tensor) -> Tensor:
@@ -339,8 +371,12 @@ class PortraitField:
         squares: Sequence[tuple[SeenPerson, PortraitMaps]],
     ) -> "PortraitField":
         """Return the field from maps of each square; all of it uses the face field's white balance."""
-        views = tuple(PortraitView.of(*one, source, field.balance) for one in squares)
-        return PortraitField(views, field, _texels_in_square(model, head, squares[0][0]))
+        texels = _texels_in_square(model, head, squares[0][0])
+        views = tuple(
+            PortraitView.of(*one, source, field.balance, None if number else texels)
+            for number, one in enumerate(squares)
+        )
+        return PortraitField(views, field, texels)
 
     def shade(
         self, directions: Tensor, weights: Tensor, near: Sequence[tuple[PointLights, Tensor]] = ()
@@ -385,6 +421,16 @@ class PortraitField:
         """Return maps [M, C, S, S] of the first view at the texels of the face, [M, C, T, T]."""
         grid = self.texels[None].expand(len(maps), -1, -1, -1)
         return F.grid_sample(maps, grid, padding_mode="border", align_corners=False)
+
+
+def _shaded_pixels(person: SeenPerson, texels: Tensor | None) -> Pixels:
+    """Return the pixels of a person, of texels [T, T, 2] in -1..1 of the face, and those around them."""
+    chosen = (1 - person.classes[0] > _LEAST_COVERED).float()
+    if texels is not None:
+        side = len(chosen)
+        column, row = ((texels + 1) * (side / 2)).long().clamp(0, side - 1).flatten(0, 1).T
+        chosen[row, column] = 1
+    return Pixels.of(F.max_pool2d(chosen[None], 2 * _AROUND_PX + 1, 1, _AROUND_PX)[0] > 0)
 
 
 def _far_batch(lights: Tensor, weights: Tensor, maps: tuple[Tensor, Tensor, Tensor]) -> _LightBatch:

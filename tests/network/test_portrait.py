@@ -19,6 +19,7 @@ from facerf_cli.network.portrait import (
     reached_by,
     skin_exposure,
 )
+from facerf_cli.raster.texture import Pixels
 
 SIDE = 32
 TINY = PortraitSettings((8, 8, 12), (0, 1, 1), side=SIDE)
@@ -120,16 +121,29 @@ def test_highlights_lie_at_the_half_vector_and_strands_shine_across_themselves()
 
 def test_near_lights_have_a_direction_for_each_pixel() -> None:
     """Where all directions are one, they are that of a far light; halves lit apart are two far lights."""
-    maps = random_maps(seed=3)
+    pixels = Pixels.of(torch.rand(SIDE, SIDE, generator=torch.Generator().manual_seed(6)) < 0.4)
+    maps, visible = random_maps(seed=3), pixels.values(lit_everywhere(2))
+    seen, half = maps.at(pixels), len(pixels.numbers) // 2
     lights = torch.cat([one_light(40, 20), one_light(-60, 10)], 1)
-    far = maps.olats(lights, lit_everywhere(2))
-    by_pixel = lights[:, :, None, None].expand(-1, -1, SIDE, SIDE, -1)
-    torch.testing.assert_close(maps.olats(by_pixel, lit_everywhere(2)), far)
-    split = torch.cat([by_pixel[:, :1, :, : SIDE // 2], by_pixel[:, 1:, :, SIDE // 2 :]], 3)
-    found = maps.olats(split, lit_everywhere())[0, 0]
-    edge = SIDE // 2 - 2, SIDE // 2 + 2  # the coarse maps blend there
-    torch.testing.assert_close(found[..., : edge[0]], far[0, 0, ..., : edge[0]])
-    torch.testing.assert_close(found[..., edge[1] :], far[0, 1, ..., edge[1] :])
+    far = pixels.values(maps.olats(lights, lit_everywhere(2)))
+    by_pixel = lights[:, :, None, None].expand(-1, -1, 1, len(pixels.numbers), -1)
+    torch.testing.assert_close(seen.olats(by_pixel, visible), far, rtol=1e-4, atol=1e-6)
+    split = torch.cat([by_pixel[:, :1, :, :half], by_pixel[:, 1:, :, half:]], 3)
+    found = seen.olats(split, visible[:, :1])[0, 0]
+    wanted = torch.cat([far[0, 0, ..., :half], far[0, 1, ..., half:]], -1)
+    torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-6)
+
+
+def test_some_pixels_are_shaded_like_all_of_them() -> None:
+    chosen = torch.zeros(SIDE, SIDE, dtype=torch.bool)
+    chosen[3:20, 5:9] = chosen[-1, -1] = True
+    pixels, maps = Pixels.of(chosen), random_maps(seed=7)
+    lights = torch.cat([one_light(40, 20), one_light(-60, 10)], 1)
+    visible = torch.rand(1, 2, SIDE, SIDE, generator=torch.Generator().manual_seed(8))
+    found = pixels.maps(maps.at(pixels).olats(lights, pixels.values(visible)))
+    wanted = maps.olats(lights, visible)
+    torch.testing.assert_close(found[..., chosen], wanted[..., chosen], rtol=1e-4, atol=1e-6)
+    assert (found[..., ~chosen] == 0).all()
 
 
 def test_mirrored_people_and_inputs_are_the_mirrored_image() -> None:

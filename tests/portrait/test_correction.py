@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from facerf_cli.portrait.correction import Correction
+from facerf_cli.raster.texture import Pixels
 
 SIDE = 64
 
@@ -26,9 +27,26 @@ WEIGHTS = torch.tensor([[0.7, 0.6, 0.5], [0.3, 0.4, 0.5], [0.0, 0.0, 0.0]])
 PERSON = torch.ones(SIDE, SIDE)
 
 
+def correction_of(photo: Tensor, images: Tensor, weights: Tensor, person: Tensor = PERSON) -> Correction:
+    """The correction by a photo [3, S, S] of images [L, 3, S, S]; every pixel of the maps is chosen."""
+    pixels = Pixels.of(PERSON > 0)
+    photo, images, person = (pixels.values(maps) for maps in (photo, images, person))
+    return Correction.of(photo, images, weights, person, pixels)
+
+
+def excess_of(correction: Correction) -> Tensor:
+    return correction.pixels.maps(correction.excess)
+
+
+def factors_of(correction: Correction, images: Tensor) -> tuple[Tensor, Tensor]:
+    """Factors and additions of images [L, 3, S, S], in their shape."""
+    factor, added = correction.terms(correction.pixels.values(images.mean(1)))
+    return correction.pixels.maps(factor).transpose(0, 1), correction.pixels.maps(added).transpose(0, 1)
+
+
 def by_light(correction: Correction, images: Tensor) -> Tensor:
     """Corrected images [L, 3, S, S]."""
-    factor, added = (of.transpose(0, 1) for of in correction.terms(images.mean(1)))
+    factor, added = factors_of(correction, images)
     return images * factor + added
 
 
@@ -38,7 +56,7 @@ def corrected(correction: Correction) -> Tensor:
 
 def test_the_photos_light_gives_the_photo_back_and_a_right_explanation_changes_nothing() -> None:
     photo = photo_under(WEIGHTS)
-    correction = Correction.of(photo, olats(), WEIGHTS, PERSON)
+    correction = correction_of(photo, olats(), WEIGHTS)
     found = torch.einsum("lc,lcij->cij", WEIGHTS, corrected(correction))
     away = torch.ones(SIDE, SIDE, dtype=torch.bool)
     away[15:35, 15:45], away[25, 25:35] = False, True  # of the mark's edges, which are blurred
@@ -47,13 +65,13 @@ def test_the_photos_light_gives_the_photo_back_and_a_right_explanation_changes_n
     plain = torch.einsum("lc,lcij->cij", WEIGHTS, olats())
     assert (plain - photo).abs().max() > 0.1
     photo = torch.einsum("lc,lcij->cij", WEIGHTS, olats())
-    torch.testing.assert_close(corrected(Correction.of(photo, olats(), WEIGHTS, PERSON)), olats())
+    torch.testing.assert_close(corrected(correction_of(photo, olats(), WEIGHTS)), olats())
 
 
 def test_lights_that_shade_alike_are_corrected_alike_and_others_hardly() -> None:
     photo = photo_under(WEIGHTS)
     marked = (slice(None), slice(22, 28), slice(24, 36))
-    change = (corrected(Correction.of(photo, olats(), WEIGHTS, PERSON)) / olats())[(slice(None), *marked)]
+    change = (corrected(correction_of(photo, olats(), WEIGHTS)) / olats())[(slice(None), *marked)]
     first, second, other = change.mean((1, 2, 3))
     assert 0.55 < first < 0.75 and 0.55 < second < 0.75
     assert 0.97 < other < 1.03
@@ -63,17 +81,17 @@ def test_off_the_person_nothing_changes_without_stairs_or_negative_light() -> No
     person = PERSON.clone()
     person[:, :32] = 0
     photo = photo_under(WEIGHTS)
-    correction = Correction.of(photo, olats(), WEIGHTS, person)
+    correction = correction_of(photo, olats(), WEIGHTS, person)
     torch.testing.assert_close(corrected(correction)[..., :32], olats()[..., :32])
     photo[..., :32] = 3  # a bright background
-    other = Correction.of(photo, olats(), WEIGHTS, person)
-    torch.testing.assert_close(other.excess[..., 32:], correction.excess[..., 32:])
+    other = correction_of(photo, olats(), WEIGHTS, person)
+    torch.testing.assert_close(excess_of(other)[..., 32:], excess_of(correction)[..., 32:])
     # Near a sharp edge of the photo that the model does not know.
-    excess = Correction.of(photo_under(WEIGHTS), olats(), WEIGHTS, PERSON).excess[1, 25, 10:50]
+    excess = excess_of(correction_of(photo_under(WEIGHTS), olats(), WEIGHTS))[1, 25, 10:50]
     assert excess.diff().abs().max() < 0.5 * float(excess.max() - excess.min())
     photo = photo_under(WEIGHTS)
     photo[:, 20:30, 20:40] = 0
-    factor, _ = Correction.of(photo, olats(), WEIGHTS, PERSON).terms(olats().mean(1))
+    factor, _ = factors_of(correction_of(photo, olats(), WEIGHTS), olats())
     assert factor.min() >= 0
 
 
@@ -86,7 +104,7 @@ def test_the_error_of_a_shadow_is_not_enlarged_in_the_light() -> None:
     weights = torch.tensor([[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
     photo = images[0].clone()
     photo[:, 50:60, 20:40] *= 3  # not so deep a shadow
-    found = by_light(Correction.of(photo, images, weights, PERSON), images)
+    found = by_light(correction_of(photo, images, weights), images)
     change = (found - images)[:, 2, 52:58, 24:36].mean((1, 2))
     brightness = images[1].mean() / images[0].mean()
     assert change[0] > 0.1  # the photo comes back
@@ -98,6 +116,6 @@ def test_colours_of_what_is_nearly_black_are_not_multiplied() -> None:
     images[:, :, 20:30, 20:40] *= 0.05
     photo = torch.einsum("lc,lcij->cij", WEIGHTS, images)
     photo[:, 20:30, 20:40] = torch.tensor([2e-3, 1e-3, 3e-2]).view(3, 1, 1)
-    ratio = Correction.of(photo, images, WEIGHTS, PERSON).excess[:, *mark] + 1
+    ratio = excess_of(correction_of(photo, images, WEIGHTS))[:, *mark] + 1
     assert ratio.amin() > 0.3  # not at the end of its range
     assert ratio.amax() < 1.2 * ratio.amin()

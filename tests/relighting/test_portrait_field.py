@@ -159,6 +159,23 @@ def test_a_coloured_shade_leaves_the_albedo_and_the_photo_its_colour(field: Port
     assert colour.min() > 0.6  # of the photo: 0.43
 
 
+def test_the_person_and_the_faces_texture_are_shaded_and_nothing_else(field: PortraitField) -> None:
+    """Also where something hides a half of the face."""
+    person, light = field.person, lamp(20)
+    hidden = torch.zeros_like(person.classes[0])
+    hidden[:, : len(hidden) // 2] = 1
+    classes = person.classes * (1 - hidden)
+    classes[0] += hidden
+    seen = replace(person, classes=classes)
+    view = PortraitView.of(seen, field.views[0].maps, None, None, field.texels)
+    chosen = view.pixels.maps(torch.ones(1, 1, len(view.pixels.numbers)))
+    assert chosen[0, seen.own_pixels > 0].all()
+    at_texels = F.grid_sample(chosen[None], field.texels[None], padding_mode="border", align_corners=False)
+    assert at_texels.min() > 1 - 1e-6  # none mixes in black
+    assert chosen.mean() < 0.6
+    assert (view.shade(light.directions, light.weights[None]).shading[0, :, chosen[0] == 0] == 0).all()
+
+
 def test_the_person_is_as_white_as_the_photos_light_leaves_them(field: PortraitField) -> None:
     """Half of the photo's blue light doubles the blue of all that the view shows under white light."""
     view, own = field.views[0], source_light(astronaut.models(), field.field.face)
