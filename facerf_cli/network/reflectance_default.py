@@ -140,7 +140,7 @@ class DefaultReflectanceNetwork(ReflectanceNetwork):
         layers = zip(reversed(self.up), reversed(encoded.skips), reversed(coarser), strict=True)
         for up, skip, light_maps in layers:
             x = up(x, skip, light_maps, code, count)
-        gain, bias = self.head(x).float().chunk(2, 1)
+        gain, bias = self.head(x).float().contiguous().chunk(2, 1)  # textures are fastest channel by channel
         both = resize(torch.cat([gain + base, bias], 1), encoded.source_root.shape[-1])
         gain, bias = both.chunk(2, 1)
         root = torch.addcmul(bias, encoded.source_root.repeat_interleave(count, 0), gain)

@@ -26,6 +26,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from facerf_cli.network.inputs import resize
 from facerf_cli.raster.texture import Pixels, blurred_within
 
 _FLOOR = 0.05  # f, relative to the person's mean in the photo
@@ -140,12 +141,16 @@ class Quotient:
         reconstruction. It compares the shading of the face, not light directions: a photo in uniform light
         hardly corrects a light from the side.
         """
-        side = olats.shape[-2:]
+        side = olats.shape[-1]
         if self.albedo is not None:
-            olats = olats * F.interpolate(self.albedo[None], side, mode="bilinear", align_corners=False)
-        small = F.interpolate(olats, self.explained.shape, mode="area").mean(1)
+            olats = olats * resize(self.albedo[None], side)
+        small = resize(olats.mean(1, keepdim=True), self.explained.shape[-1])[:, 0]
         lengths = (small * (self.explained > 0)).flatten(1).norm(dim=1) * self.explained.norm()
         likeness = (small * self.explained).sum((1, 2)) / lengths.clamp_min(1e-12)
         power = likeness.clamp(0, 1)[:, None, None, None] ** _FACE_SHARPNESS
-        ratio = F.interpolate(self.ratio[None].log(), side, mode="bilinear", align_corners=False)
-        return olats * torch.exp(power * ratio)
+        return olats * (power * resize(self.ratio[None].log(), side)).exp_()
+
+    def enlarged(self, side: int) -> "Quotient":
+        """Return the same correction with maps of a side, which textures of that side need not resize."""
+        albedo = None if self.albedo is None else resize(self.albedo[None], side)[0]
+        return replace(self, ratio=resize(self.ratio[None].log(), side)[0].exp(), albedo=albedo)

@@ -216,19 +216,20 @@ class Inpainting:
     """`inpaint` of several textures with the same visibility [..., T, T]."""
 
     def __init__(self, visible: Tensor) -> None:
-        self._levels = list[tuple[Tensor, Tensor]]()  # visibility, and its mean over 2 x 2 texels
+        self._levels = list[tuple[Tensor, Tensor]]()  # visibility, and its sums over 2 x 2 texels
         visible = visible.reshape(-1, 1, *visible.shape[-2:])
         while max(visible.shape[-2:]) > 1:
-            weight = _mean_of_four(visible)
-            self._levels.append((visible, weight.clamp(min=_TINY)))
-            visible = (4 * weight).clamp(max=1)  # one visible texel of four is enough
+            total = _sums_of_four(visible)
+            self._levels.append((visible, total.clamp(min=_TINY)))
+            count = _sums_of_four(torch.ones_like(visible))
+            visible = (4 / count * total).clamp(max=1)  # one visible texel of four is enough
         self._any = visible > 0
 
     def __call__(self, texture: Tensor) -> Tensor:
         """Fill a texture [..., C, T, T]."""
         coarser = [texture.reshape(-1, *texture.shape[-3:])]
-        for visible, weight in self._levels:
-            coarser.append(_mean_of_four(coarser[-1] * visible) / weight)
+        for visible, total in self._levels:
+            coarser.append(_sums_of_four(coarser[-1] * visible) / total)
         filled = coarser.pop() * self._any
         for (visible, _), seen in zip(reversed(self._levels), reversed(coarser), strict=True):
             fill = F.interpolate(filled, size=visible.shape[-2:], mode="bilinear", align_corners=False)
@@ -236,8 +237,12 @@ class Inpainting:
         return filled.view_as(texture)
 
 
-def _mean_of_four(maps: Tensor) -> Tensor:
-    return F.avg_pool2d(maps, 2, ceil_mode=True, count_include_pad=False)
+def _sums_of_four(maps: Tensor) -> Tensor:
+    """Return sums [..., h / 2, w / 2] over 2 x 2 texels, rounded up; twice as fast as `avg_pool2d`."""
+    if maps.shape[-2] % 2 or maps.shape[-1] % 2:
+        maps = F.pad(maps, (0, maps.shape[-1] % 2, 0, maps.shape[-2] % 2))
+    rows = maps[..., ::2, :] + maps[..., 1::2, :]
+    return rows[..., ::2] + rows[..., 1::2]
 
 
 def blurred(maps: Tensor, sigma_px: float) -> Tensor:

@@ -123,9 +123,9 @@ class FaceDetail:
 
         `mouth` [3, T, T] is the face relit by the light that enters the mouth.
         """
-        around = self._around_skin(texture)
+        around = self._around_skin(texture if mouth is None else torch.cat([texture, mouth]))
         if mouth is not None:
-            around = torch.lerp(around, self._around_skin(mouth), _CAVITY * self._mouth)
+            around = torch.lerp(*around.chunk(2), _CAVITY * self._mouth)
         return torch.cat([texture, around / self._around_source])
 
     def over(self, part: Window, photo: np.ndarray) -> Callable[[Tensor], np.ndarray]:

@@ -93,9 +93,8 @@ class Field:
                 olats, new = known.textures[number], number < 0
                 if new.any():
                     olats[new] = predicted(batch[new])
-            olats = self.quotient.corrected(olats) if self.quotient else olats
-            olats = olats if self.detail is None else olats * self.detail
-            return olats if self.balance is None else olats * self.balance.gain[:, None, None]
+            olats = self._quotient.corrected(olats) if self._quotient else olats
+            return olats if self._factor is None else olats * self._factor
 
         yield from in_threads(decoded, torch.split(lights, self._batch(len(lights))))
 
@@ -132,6 +131,18 @@ class Field:
         network: Any = self._network
         inputs = (self.face.texture, *network.parameters())
         return torch.is_grad_enabled() and any(values.requires_grad for values in inputs)
+
+    @cached_property
+    def _quotient(self) -> Quotient | None:
+        return self.quotient.enlarged(self.face.texture.shape[-1]) if self.quotient else None
+
+    @cached_property
+    def _factor(self) -> Tensor | None:
+        """Detail and white balance, [3, T, T] or [3, 1, 1]."""
+        if self.balance is None:
+            return self.detail
+        gain = self.balance.gain[:, None, None]
+        return gain if self.detail is None else gain * self.detail
 
     @cached_property
     def _encoded(self) -> Any:

@@ -237,9 +237,7 @@ class PortraitView:
             for at in parts
         ]
         view = replace(plain, correction=correction)
-        if balance is not None:
-            view = replace(view, uniform=view._sums(1, ambient)).with_white_balance(balance)
-        return replace(view, uniform=view._sums(1, ambient))
+        return replace(view, uniform=view._sums(1, ambient)).with_white_balance(balance)
 
     def with_white_balance(self, balance: WhiteBalance | None) -> "PortraitView":
         """Return a copy whose albedo is white-balanced."""
