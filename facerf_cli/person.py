@@ -60,7 +60,7 @@ if TYPE_CHECKING:
 
 Pose = tuple[float, float, float] | Tensor  # yaw, pitch and roll in degrees (docs/design.md)
 Background = Literal["photo", "none"] | Array | tuple[float, float, float]
-_LIGHTS_AT_ONCE, _PIXELS_AT_ONCE = 16, 1 << 23  # upper limits for a batch of OLAT images
+_LIGHTS_AT_ONCE, _PIXELS_AT_ONCE = 8, 1 << 23  # upper limits for a batch of OLAT images
 
 
 def find_faces(models: Models, photo: Array, which: str = "all", name: str = "photo") -> list[Face]:

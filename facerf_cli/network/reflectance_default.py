@@ -140,9 +140,9 @@ class DefaultReflectanceNetwork(ReflectanceNetwork):
         layers = zip(reversed(self.up), reversed(encoded.skips), reversed(coarser), strict=True)
         for up, skip, light_maps in layers:
             x = up(x, skip, light_maps, code, count)
-        gain, bias = self.head(x).float().contiguous().chunk(2, 1)  # textures are fastest channel by channel
-        both = resize(torch.cat([gain + base, bias], 1), encoded.source_root.shape[-1])
-        gain, bias = both.chunk(2, 1)
+        both = self.head(x).float().contiguous()  # not channels-last: textures are multiplied by maps
+        both[:, :3] += base
+        gain, bias = resize(both, encoded.source_root.shape[-1]).chunk(2, 1)
         root = torch.addcmul(bias, encoded.source_root.repeat_interleave(count, 0), gain)
         return root.view(faces, count, *root.shape[1:])
 
@@ -201,9 +201,9 @@ class LitUp(nn.Module):
         x = self.enter(x)
         if self.scale == 2:
             x = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
-        x = x + self.light(maps)
+        x = self.light(maps).add_(x)
         x.view(-1, lights, *x.shape[1:]).add_(skip[:, None])
         scale, shift = self.modulation(code)[..., None, None].chunk(2, 1)
-        x = F.silu(torch.addcmul(shift, x, 1 + scale))
-        x = F.silu(self.inner(x)).add_(x)
-        return F.silu(self.outer(x)).add_(x)
+        x = F.silu(x.mul_(1 + scale).add_(shift), inplace=True)
+        x = F.silu(self.inner(x), inplace=True).add_(x)
+        return F.silu(self.outer(x), inplace=True).add_(x)

@@ -125,6 +125,7 @@ class PersonInPhoto:
         self._covered = covering(field.person.segmentation.classes)[None].numpy()
         self._views = [UpsampledView(view) for view in field.views]
         self._detail = FaceDetail(head.face, self.view)
+        self._whole: dict[bool, Callable[[PersonLight], dict[str, np.ndarray]]] = {}  # without rims or with them
 
     @property
     def nbytes(self) -> int:
@@ -212,7 +213,11 @@ class PersonInPhoto:
         columns = slice(int(used[0]), int(used[-1]) + 1) if len(used) else slice(0, 1)
         among = Window(window.rows, columns)
         rims = self._rims if any("rear" in maps for light in lights for maps in light.views) else None
-        by_maps = self._by_maps(among, own[:, among.columns], rims)
+        is_whole = window.shape == self.size_px  # then the next lights are rendered in the same window
+        by_maps = self._whole.get(rims is None) if is_whole else None
+        if by_maps is None:
+            by_maps = self._by_maps(among, own[:, among.columns], rims)
+            self._whole = {rims is None: by_maps} if is_whole else {}
         for light in lights:
             values = by_maps(light)
             whole = values["rgb"]
