@@ -241,7 +241,7 @@ def run() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # its systems are too small for threads
     _prepare_streams()
     memory.collect_seldom()
-    memory.share_freed()
+    memory.reuse_freed()
     try:
         code = main(sys.argv[1:])
     except SystemExit as stop:  # raised by a signal; the interpreter's own exit would report leaks

@@ -252,7 +252,7 @@ def test_a_signal_ends_the_process_without_what_libraries_say_at_its_end(monkeyp
     monkeypatch.setattr(main, "end_on_signals", lambda patience_s: None)
     monkeypatch.setattr(main, "leave", left.append)
     monkeypatch.setattr(main.memory, "collect_seldom", lambda: None)
-    monkeypatch.setattr(main.memory, "share_freed", lambda: None)
+    monkeypatch.setattr(main.memory, "reuse_freed", lambda: None)
     monkeypatch.setattr(os, "environ", dict(os.environ))  # `run` sets variables for its children
     main.run()
     assert left == [143]

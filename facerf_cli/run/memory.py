@@ -16,7 +16,13 @@ from facerf_cli.run.machine import memory_bytes
 SHARE = 0.5  # fraction of `memory_bytes` that all jobs of a run have together, by default
 _GB = 1 << 30
 _RELIT_HELD = 4  # copies of the relit maps in memory while lights are added to them
-_M_ARENA_MAX = -8  # of malloc.h
+_MB = 1 << 20
+_MALLOC = {  # options of malloc.h: number and value
+    "M_ARENA_MAX": (-8, 1),  # with an arena per thread a photo would need more memory
+    "M_MMAP_THRESHOLD": (-3, 32 * _MB),  # the largest: smaller blocks are reused
+    "M_TRIM_THRESHOLD": (-1, 64 * _MB),
+    "M_TOP_PAD": (-2, 32 * _MB),
+}
 _SELDOM, _USUAL = (50_000, 10, 10), gc.get_threshold()
 _set: list[int] = []  # the limit, once it was set
 _held: list[int] = []  # bytes held besides those that `require` asks for
@@ -66,9 +72,13 @@ def give_back() -> None:
     _call_libc("malloc_trim", 0)
 
 
-def share_freed() -> None:
-    """Let all threads reuse what any has freed; with glibc's arena per thread a photo would need more."""
-    _call_libc("mallopt", _M_ARENA_MAX, 1)
+def reuse_freed() -> None:
+    """Let all threads reuse what any has freed, without returning it to the system each time.
+
+    Fresh memory has to be cleared by the system, which takes up to a tenth of a photo's time.
+    """
+    for number, value in _MALLOC.values():
+        _call_libc("mallopt", number, value)
 
 
 def _call_libc(name: str, *arguments: Any) -> None:
