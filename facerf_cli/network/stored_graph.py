@@ -48,7 +48,9 @@ class StoredGraph(nn.Module):
     @torch.inference_mode()
     def forward(self, images: Tensor) -> dict[str, Tensor]:
         """See the class."""
-        images = images.to(self.device, memory_format=torch.channels_last)  # convolved faster, as in `_restore`
+        images = images.to(
+            self.device, memory_format=torch.channels_last
+        )  # convolved faster, as in `_restore`
         values: dict[int | str, Any] = {0: images}
         values.update(self.constants)
         for operator, inputs, output, settings in self.graph["steps"]:

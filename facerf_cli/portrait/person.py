@@ -23,7 +23,7 @@ from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import OtherHead
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.image.colour import to_display, without_fireflies
-from facerf_cli.image.strips import resized
+from facerf_cli.image.strips import Window, resized
 from facerf_cli.network.portrait import SKIN, PortraitInputs, PortraitMaps, reached_by, skin_exposure
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.find import SeenEyes, eyes_of
@@ -38,7 +38,7 @@ from facerf_cli.portrait.proxy import (
     square_camera,
 )
 from facerf_cli.portrait.segment import Segmentation, segment
-from facerf_cli.raster.camera import PIXEL_CENTRE
+from facerf_cli.raster.camera import PIXEL_CENTRE, Camera
 from facerf_cli.run.logs import LOGGER_NAME, step
 
 SIDE_PX = 192  # pixels of the square around head and shoulders in the Portrait Network's training
@@ -47,6 +47,8 @@ SIDES = 3.0  # side of the square in extents of the landmarks: the larger side o
 _WIDEST = 7.0  # largest side of the square around the whole person, in these extents
 _NEAR_IRIS = 1.5  # radius around an iris whose light the iris reflects, in its radii
 _FINEST = 3  # largest number of shadow samples along a pixel of the maps
+_BARE = [class_index(name) for name in ("skin", "lips", "beard", "ears", "neck")]
+_LEAST_BARE = 0.02  # coverage below which shadows are not worth their time
 _OVERHANG = 0.03  # tolerated overhang of a person over the square, in its sides; and its margin
 _LENGTHS = (0.5, 1.5)  # range of the length of valid normals; black in a PNG is longer
 _SURE = 0.5  # least fraction of skin of the pixels that determine the axes
@@ -123,11 +125,29 @@ class SeenPerson:
         return Shadows(self.proxy, proxy_maps(self.proxy, square_camera(self.fit, half)))
 
     @cached_property
-    def finer(self) -> ProxyMaps:
-        """Proxy, not filled, at the photo's resolution, up to `_FINEST` pixels per pixel of the maps."""
-        times = min(_FINEST, math.ceil(1 / self.square.scale))
-        fine = replace(self.square, size_px=self.square.size_px * times)
-        return proxy_maps(self.proxy, square_camera(self.fit, fine), filled=False)
+    def bare(self) -> Tensor:
+        """Coverage [S, S] of bare skin; 0 where it is hardly any."""
+        coverage = self.classes[_BARE].sum(0)
+        return coverage * (coverage > _LEAST_BARE)
+
+    @property
+    def finer_size_px(self) -> int:
+        """Side of the square in the pixels of `finer`."""
+        return self.square.size_px * min(_FINEST, math.ceil(1 / self.square.scale))
+
+    @cached_property
+    def finer(self) -> tuple[ProxyMaps, Window]:
+        """Proxy, not filled, around bare skin at the photo's resolution, and this window of the square.
+
+        A pixel of the maps has at most `_FINEST` pixels along each side.
+        """
+        whole = square_camera(self.fit, replace(self.square, size_px=self.finer_size_px))
+        times, bare = self.finer_size_px // self.square.size_px, self.bare.numpy()
+        used = [np.flatnonzero(bare.any(axis)) if bare.any() else np.arange(len(bare)) for axis in (1, 0)]
+        window = Window(*(slice(at[0] // 3 * 3 * times, (at[-1] + 1) * times) for at in used))
+        (height_px, width_px), (top, left) = window.shape, (part.start for part in window)
+        camera = Camera(whole.focal_px, width_px, height_px, whole.cx_px - left, whole.cy_px - top)
+        return proxy_maps(self.proxy, camera, filled=False), window
 
     def inputs(self, rig: Tensor) -> PortraitInputs:
         """Return the network's inputs [1, ...], with the visibility of a rig [L, 3]."""

@@ -131,8 +131,8 @@ def proxy_maps(proxy: Proxy, camera: Camera, filled: bool = True) -> ProxyMaps:
 class Shadows:
     """Visibility of lights from each pixel of a proxy's maps, which the proxy itself occludes.
 
-    A surface that faces away sees no light. Independent of the light are: the covered pixels [s, s], the
-    rays' origins [N, 3], and numbers [rays, 2, N, 1] in 0..1, which place the rays on the disc of a light.
+    A surface that faces away sees no light. Independent of the light are the rays' origins [N, 3], and
+    numbers [rays, 2, N, 1] in 0..1, which place the rays on the disc of a light.
     """
 
     def __init__(self, proxy: Proxy, maps: ProxyMaps) -> None:

@@ -20,12 +20,10 @@ from torch import Tensor
 
 from facerf_cli.light.light import PointLights
 from facerf_cli.light.transport import first_hits_m, on_disc, places_on_disc
-from facerf_cli.portrait.parse import class_index
 from facerf_cli.portrait.proxy import OFF_M, RADIUS_DEG, Proxy, ProxyMaps
 from facerf_cli.raster.texture import inpaint, smoothstep
 from facerf_cli.relighting.portrait_field import PortraitView
 
-_BARE = [class_index(name) for name in ("skin", "lips", "beard", "ears", "neck")]
 _CHANGES, _NEARBY_PX = 0.02, 2  # least change of V, and how close it must be, in pixels of V
 _RAYS = 8  # per pixel of the grid
 _PATTERN = 3  # side in pixels of the squares in which rays differ and V' is averaged
@@ -59,18 +57,22 @@ def cast_shadow(view: PortraitView, light: Tensor | PointLights) -> CastShadow:
         shading, specular, _ = seen.shaded(lights[None], everywhere)
         radiance = seen.albedo[0].mean(0) * shading[0] + specular[0]
         shades.append((strength * radiance).sum(0))
-    maps = person.finer
-    wide = _enlarged(coarse.mean(0), maps.covered)
-    facing = smoothstep(torch.einsum("cij,c->ij", maps.normals, middle) / _FACING)
+    (maps, window), size_px = person.finer, person.finer_size_px
     changes = _highest(coarse.mean(0)) + _highest(-coarse.mean(0)) > _CHANGES
-    bare, changes = (_enlarged(one, maps.covered) for one in (person.classes[_BARE].sum(0), changes.float()))
-    weight = facing * maps.covered * bare * changes
+    wide, bare, changes = (
+        _enlarged(one, (size_px, size_px)) for one in (coarse.mean(0), person.bare, changes.float())
+    )
+    around = wide[window]
+    facing = smoothstep(torch.einsum("cij,c->ij", maps.normals, middle) / _FACING)
+    weight = facing * maps.covered * bare[window] * changes[window]
     traced = weight.numpy() > 0
-    fine = wide.clone()
-    fine[traced] = visibility(person.proxy, maps, traced, wide, ends, isinstance(light, PointLights))
+    fine = around.clone()
+    fine[traced] = visibility(person.proxy, maps, traced, around, ends, isinstance(light, PointLights))
     fine = F.avg_pool2d(fine[None], _PATTERN, 1, _PATTERN // 2, count_include_pad=False)[0]
+    sharp = wide.clone()
+    sharp[window] = torch.lerp(around, fine, weight)
     shade = inpaint(pixels.maps(torch.stack(shades)), person.own_pixels)
-    return CastShadow(torch.stack([torch.lerp(wide, fine, weight), wide]), shade)
+    return CastShadow(torch.stack([sharp, wide]), shade)
 
 
 def visibility(
@@ -114,8 +116,8 @@ def change(shadow: CastShadow) -> Tensor:
     return ((least + fine * more) / (least + coarse * more)).clamp(0, _MOST)
 
 
-def _enlarged(map_: Tensor, like: Tensor) -> Tensor:
-    return F.interpolate(map_[None, None], like.shape, mode="bilinear", align_corners=False)[0, 0]
+def _enlarged(map_: Tensor, size: tuple[int, int]) -> Tensor:
+    return F.interpolate(map_[None, None], size, mode="bilinear", align_corners=False)[0, 0]
 
 
 def _highest(map_: Tensor) -> Tensor:

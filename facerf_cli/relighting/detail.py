@@ -125,7 +125,8 @@ class FaceDetail:
         """
         around = self._around_skin(texture if mouth is None else torch.cat([texture, mouth]))
         if mouth is not None:
-            around = torch.lerp(*around.chunk(2), _CAVITY * self._mouth)
+            outside, inside = around.chunk(2)
+            around = torch.lerp(outside, inside, _CAVITY * self._mouth)
         return torch.cat([texture, around / self._around_source])
 
     def over(self, part: Window, photo: np.ndarray) -> Callable[[Tensor], np.ndarray]:

@@ -125,7 +125,7 @@ class PersonInPhoto:
         self._covered = covering(field.person.segmentation.classes)[None].numpy()
         self._views = [UpsampledView(view) for view in field.views]
         self._detail = FaceDetail(head.face, self.view)
-        self._whole: dict[bool, Callable[[PersonLight], dict[str, np.ndarray]]] = {}  # without rims or with them
+        self._last: tuple[tuple[Window, bool], Callable[[PersonLight], dict[str, np.ndarray]]] | None = None
 
     @property
     def nbytes(self) -> int:
@@ -213,11 +213,12 @@ class PersonInPhoto:
         columns = slice(int(used[0]), int(used[-1]) + 1) if len(used) else slice(0, 1)
         among = Window(window.rows, columns)
         rims = self._rims if any("rear" in maps for light in lights for maps in light.views) else None
-        is_whole = window.shape == self.size_px  # then the next lights are rendered in the same window
-        by_maps = self._whole.get(rims is None) if is_whole else None
+        place = among, rims is None
+        by_maps = self._last[1] if self._last and self._last[0] == place else None
         if by_maps is None:
             by_maps = self._by_maps(among, own[:, among.columns], rims)
-            self._whole = {rims is None: by_maps} if is_whole else {}
+        if window.shape == self.size_px:  # the next lights are rendered in the same window
+            self._last = place, by_maps
         for light in lights:
             values = by_maps(light)
             whole = values["rgb"]

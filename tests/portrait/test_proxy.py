@@ -123,9 +123,10 @@ def test_rays_of_a_pixel_are_those_of_the_frame_before() -> None:
     camera = square_camera(fit(), SQUARE)
     numbers = []
     for hair_px in (20.0, 34.0):
-        shadows = Shadows(proxy(hair_px=hair_px), proxy_maps(proxy(hair_px=hair_px), camera))
+        maps = proxy_maps(proxy(hair_px=hair_px), camera)
+        shadows = Shadows(proxy(hair_px=hair_px), maps)
         placed = np.full((*shadows.numbers.shape[:2], SIDE, SIDE), np.nan)
-        placed[:, :, shadows.covered.numpy() > 0] = shadows.numbers[..., 0]
+        placed[:, :, maps.covered.numpy() > 0] = shadows.numbers[..., 0]
         numbers.append(placed)
     both = np.isfinite(numbers[0]) & np.isfinite(numbers[1])
     assert np.isfinite(numbers[1]).sum() > np.isfinite(numbers[0]).sum()

@@ -27,7 +27,7 @@ from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.photo_light import source_light
 from facerf_cli.relighting.portrait_field import PersonShading, PortraitField, PortraitView, maps_of
-from facerf_cli.relighting.relightable import RenderRequest
+from facerf_cli.relighting.relightable import Relightable, RenderRequest
 from facerf_cli.relighting.upsampled import UpsampledView
 from tests import astronaut
 
@@ -319,6 +319,18 @@ def test_no_pixel_depends_on_the_strip_that_it_is_in(
     np.testing.assert_allclose(at_once[0], image, atol=1e-4, rtol=2**-9)
     for one, other in zip(at_once[1:], layers, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-4 * max(1.0, float(np.abs(one).max())))
+
+
+def test_lights_one_after_the_other_are_rendered_like_each_alone(person: Person) -> None:
+    """Also light from behind, which is read elsewhere in the maps."""
+    lights = [one_sum(lamp(40, 30)), one_sum(lamp(170, 10)), one_sum(lamp(-30))]
+
+    def image(people: Relightable, light: Light) -> np.ndarray:
+        return people.rendered(RenderRequest(next(iter(people.relit(light)))))["rgb"]
+
+    people = person.prepare()
+    for light in lights:
+        np.testing.assert_array_equal(image(people, light), image(person.prepare(), light))
 
 
 def test_wider_squares_hold_the_person_and_go_on_where_that_of_the_head_ends(field: PortraitField) -> None:
