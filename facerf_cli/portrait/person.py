@@ -47,6 +47,7 @@ SIDES = 3.0  # side of the square in extents of the landmarks: the larger side o
 _WIDEST = 7.0  # largest side of the square around the whole person, in these extents
 _NEAR_IRIS = 1.5  # radius around an iris whose light the iris reflects, in its radii
 _FINEST = 3  # largest number of shadow samples along a pixel of the maps
+PATTERN_PX = 3  # side of the squares of pixels of which each has other rays; windows start between them
 _BARE = [class_index(name) for name in ("skin", "lips", "beard", "ears", "neck")]
 _LEAST_BARE = 0.02  # coverage below which shadows are not worth their time
 _OVERHANG = 0.03  # tolerated overhang of a person over the square, in its sides; and its margin
@@ -144,7 +145,7 @@ class SeenPerson:
         whole = square_camera(self.fit, replace(self.square, size_px=self.finer_size_px))
         times, bare = self.finer_size_px // self.square.size_px, self.bare.numpy()
         used = [np.flatnonzero(bare.any(axis)) if bare.any() else np.arange(len(bare)) for axis in (1, 0)]
-        window = Window(*(slice(at[0] // 3 * 3 * times, (at[-1] + 1) * times) for at in used))
+        window = Window(*(slice((at[0] - at[0] % PATTERN_PX) * times, (at[-1] + 1) * times) for at in used))
         (height_px, width_px), (top, left) = window.shape, (part.start for part in window)
         camera = Camera(whole.focal_px, width_px, height_px, whole.cx_px - left, whole.cy_px - top)
         return proxy_maps(self.proxy, camera, filled=False), window

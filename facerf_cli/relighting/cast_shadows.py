@@ -20,13 +20,13 @@ from torch import Tensor
 
 from facerf_cli.light.light import PointLights
 from facerf_cli.light.transport import first_hits_m, on_disc, places_on_disc
+from facerf_cli.portrait.person import PATTERN_PX
 from facerf_cli.portrait.proxy import OFF_M, RADIUS_DEG, Proxy, ProxyMaps
 from facerf_cli.raster.texture import inpaint, smoothstep
 from facerf_cli.relighting.portrait_field import PortraitView
 
 _CHANGES, _NEARBY_PX = 0.02, 2  # least change of V, and how close it must be, in pixels of V
 _RAYS = 8  # per pixel of the grid
-_PATTERN = 3  # side in pixels of the squares in which rays differ and V' is averaged
 _NEAR_M, _FAR_M = 0.004, 0.016  # hits closer than this are folds of the proxy; hits beyond this are occluders
 _FACING = 0.15  # cosine of normal and light above which V' has full weight
 _DIM, _DARK = 0.02, 0.003  # added to both: fraction of R1, and radiance in the network's units
@@ -68,7 +68,7 @@ def cast_shadow(view: PortraitView, light: Tensor | PointLights) -> CastShadow:
     traced = weight.numpy() > 0
     fine = around.clone()
     fine[traced] = visibility(person.proxy, maps, traced, around, ends, isinstance(light, PointLights))
-    fine = F.avg_pool2d(fine[None], _PATTERN, 1, _PATTERN // 2, count_include_pad=False)[0]
+    fine = F.avg_pool2d(fine[None], PATTERN_PX, 1, PATTERN_PX // 2, count_include_pad=False)[0]
     sharp = wide.clone()
     sharp[window] = torch.lerp(around, fine, weight)
     shade = inpaint(pixels.maps(torch.stack(shades)), person.own_pixels)
@@ -86,8 +86,8 @@ def visibility(
     normals, points = (field.numpy()[:, traced].T for field in (maps.normals, maps.positions_m))
     origins = (points + OFF_M * normals).astype(np.float32)
     y, x = np.nonzero(traced)
-    cell = (y % _PATTERN) * _PATTERN + x % _PATTERN  # each square contains all rays
-    cells, samples, otherwise = _PATTERN**2, ends.numpy(), coarse.numpy()[traced]
+    cell = (y % PATTERN_PX) * PATTERN_PX + x % PATTERN_PX  # each square contains all rays
+    cells, samples, otherwise = PATTERN_PX**2, ends.numpy(), coarse.numpy()[traced]
     total = np.zeros(len(origins), np.float32)
     for ray in range(_RAYS):
         place = (ray * cells + cell + 0.5) / (_RAYS * cells)  # 0 to 1

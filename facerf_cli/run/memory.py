@@ -75,7 +75,7 @@ def give_back() -> None:
 def reuse_freed() -> None:
     """Let all threads reuse what any has freed, without returning it to the system each time.
 
-    Fresh memory has to be cleared by the system, which takes up to a tenth of a photo's time.
+    Fresh memory has to be cleared by the system, which takes a few hundredths of a photo's time.
     """
     for number, value in _MALLOC.values():
         _call_libc("mallopt", number, value)
