@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from facerf_cli.light.sh import mirror_signs, sh_basis
 from facerf_cli.network.base import Blocks, Classes, Side, WidthsOfFour
 from facerf_cli.network.batch import Batch
-from facerf_cli.network.inputs import MEAN_RADIANCE
+from facerf_cli.network.inputs import MEAN_RADIANCE, resize
 from facerf_cli.network.parsing import Residual, UNet
 from facerf_cli.raster.texture import Pixels, smoothstep
 
@@ -151,8 +151,7 @@ class PortraitMaps(NamedTuple):
 
     def at(self, pixels: Pixels) -> "PortraitMaps":
         """Return the maps at some pixels."""
-        size = self.normals.shape[-2:]
-        return PortraitMaps(*(pixels.values(_enlarged(maps, size)) for maps in self))
+        return PortraitMaps(*(pixels.values(resize(maps, self.normals.shape[-1])) for maps in self))
 
     def without_colours(self) -> "PortraitMaps":
         """Return maps with grey gain, bias and albedo, for grey photos."""
@@ -168,10 +167,9 @@ class PortraitMaps(NamedTuple):
         product = "blijc,bcij->blij" if lights.dim() == 5 else "blc,bcij->blij"
         basis = sh_basis(lights, SHADOW_ORDER)  # [B, L, K] or [B, L, 1, N, K]
         few = basis[..., : (LIT_ORDER + 1) ** 2]
-        size = self.normals.shape[-2:]
 
         def over(basis: Tensor, maps: Tensor) -> Tensor:
-            return _enlarged(torch.einsum(product, basis, maps), size)
+            return resize(torch.einsum(product, basis, maps), self.normals.shape[-1])
 
         visible = torch.sigmoid(self.trust * (2 * visible - 1) + over(basis, self.shadow))
         cosine = torch.einsum(product, lights, self.normals)
@@ -191,13 +189,6 @@ class PortraitMaps(NamedTuple):
         """Return images [B, L, 3, S, S] under single lights of rgb 1; see `shaded`."""
         shading, glow, _ = self.shaded(lights, visible)
         return self.albedo[:, None] * shading[:, :, None] + glow[:, :, None]
-
-
-def _enlarged(maps: Tensor, size: torch.Size) -> Tensor:
-    """Return maps [B, C, h, w] at another size [H, W]."""
-    if maps.shape[-2:] == size:
-        return maps
-    return F.interpolate(maps, size=size, mode="bilinear", align_corners=False)
 
 
 class PortraitNetwork(UNet):

@@ -48,10 +48,8 @@ class StoredGraph(nn.Module):
     @torch.inference_mode()
     def forward(self, images: Tensor) -> dict[str, Tensor]:
         """See the class."""
-        images = images.to(
-            self.device, memory_format=torch.channels_last
-        )  # convolved faster, as in `_restore`
-        values: dict[int | str, Any] = {0: images}
+        # processors convolve faster in this format
+        values: dict[int | str, Any] = {0: images.to(self.device, memory_format=torch.channels_last)}
         values.update(self.constants)
         for operator, inputs, output, settings in self.graph["steps"]:
             values[output] = OPERATORS[operator](*(values[key] for key in inputs), **settings)

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from facerf_cli.light.light import PointLights
 from facerf_cli.light.transport import first_hits_m, on_disc, places_on_disc
+from facerf_cli.network.inputs import resize
 from facerf_cli.portrait.person import PATTERN_PX
 from facerf_cli.portrait.proxy import OFF_M, RADIUS_DEG, Proxy, ProxyMaps
 from facerf_cli.raster.texture import inpaint, smoothstep
@@ -60,7 +61,7 @@ def cast_shadow(view: PortraitView, light: Tensor | PointLights) -> CastShadow:
     (maps, window), size_px = person.finer, person.finer_size_px
     changes = _highest(coarse.mean(0)) + _highest(-coarse.mean(0)) > _CHANGES
     wide, bare, changes = (
-        _enlarged(one, (size_px, size_px)) for one in (coarse.mean(0), person.bare, changes.float())
+        resize(one[None, None], size_px)[0, 0] for one in (coarse.mean(0), person.bare, changes.float())
     )
     around = wide[window]
     facing = smoothstep(torch.einsum("cij,c->ij", maps.normals, middle) / _FACING)
@@ -114,10 +115,6 @@ def change(shadow: CastShadow) -> Tensor:
     (fine, coarse), (dark, light) = shadow
     more, least = light - dark, dark + _DIM * light + _DARK
     return ((least + fine * more) / (least + coarse * more)).clamp(0, _MOST)
-
-
-def _enlarged(map_: Tensor, size: tuple[int, int]) -> Tensor:
-    return F.interpolate(map_[None, None], size, mode="bilinear", align_corners=False)[0, 0]
 
 
 def _highest(map_: Tensor) -> Tensor:
